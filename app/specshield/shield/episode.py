@@ -30,9 +30,8 @@ from specshield.shield.judgement import (
     Judged,
     Situation,
     as_actions,
-    feasible_mass_of,
+    as_numbers,
     j_values_of,
-    robustness_of,
     without,
     witnesses_of,
 )
@@ -170,7 +169,9 @@ def decide(
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
-    certified = witnesses_of(shield, judged)
+    certified, unknown, mass = witnesses_of(shield, judged), (None,) * len(robot.actions), None
+    if judged is not None and answer.conditional is not None:
+        mass = shaping.feasible_mass(answer.conditional, judged.feasible)
     if chance is not None:
         left = next_left(left, chance, answer.distribution, robot.terminal)
     elif shield.config.threshold_over == "episode":
@@ -185,13 +186,13 @@ def decide(
         t=t,
         mode=answer.mode,
         distribution=answer.distribution,
-        j_values=j_values_of(shield, judged),
-        robustness=robustness_of(shield, judged),
+        j_values=unknown if judged is None else as_numbers(j_values_of(shield, judged)),
+        robustness=unknown if judged is None else as_numbers(judged.robustness),
         action=action,
         action_name=robot.actions[action].name,
         completion_action=None if judged is None else judged.completion,
         spec_status=spec_status,
-        feasible_mass=feasible_mass_of(answer.conditional, judged),
+        feasible_mass=mass,
         kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
         reason=answer.reason,
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,

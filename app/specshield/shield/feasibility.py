@@ -243,19 +243,14 @@ class Best(NamedTuple):
     row: Ints
 
 
-def best_of(tried: Futures, values: Floats, motions: int) -> Best:
-    """The future of each motion with the highest of `values` (N,), the lowest row on ties."""
-    best = Best(np.empty(motions), np.empty(motions, np.int64))
-    best_rows(tried.motions, values, best)
-    return best
-
-
 @kernel
-def best_rows(motions: Ints, values: Floats, best: Best) -> None:
-    """Writes `best_of`."""
-    best.row[:] = -1
-    best.robustness[:] = -np.inf
+def best_of(motions: Ints, values: Floats, count: int) -> Best:
+    """Of each of `count` motions, the future with the highest of `values` (N,), the lowest row on ties.
+    motions [N, T - t]: of the futures.
+    """
+    best = Best(np.full(count, -np.inf), np.full(count, -1))
     for f in range(motions.shape[0]):
         m = motions[f, 0]
         if best.row[m] < 0 or values[f] > best.robustness[m]:
             best.row[m], best.robustness[m] = f, values[f]
+    return best

@@ -15,7 +15,6 @@ from specshield.compiled import kernel
 from specshield.robot.barred import in_vain
 from specshield.robot.room import has_room, widened
 from specshield.rule.residual import again, joined, left_over
-from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, holding, is_place
@@ -83,12 +82,12 @@ def judge(shield: Shield, now: Situation) -> Judged:
     if violated:
         tried, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried.poses)
-    best, left_out = best_of(tried, kept, motions), np.zeros(motions, np.bool_)
+    best, left_out = best_of(tried.motions, kept, motions), np.zeros(motions, np.bool_)
     if care.barred is not None:
         others = _aside(shield, care.barred, prefix, tried, kept)
         vain = others.max() <= SATISFIED_ABOVE
         if not vain:
-            without_it = best_of(tried, others, motions)
+            without_it = best_of(tried.motions, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
             kept, best = others, without_it
     follows, had = recovers(shield.config) and tail is not None and len(tail) == prefix.steps, None
@@ -100,7 +99,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
             none = aim(shield, care, part, tried, kept, leaves, follows)
             roomy, had = (True, had) if had.slack >= none.slack else (False, none)
         kept = apart if roomy else kept
-        best = best_of(tried, kept, motions)
+        best = best_of(tried.motions, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy is slow for so few
@@ -118,7 +117,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
                     kept = _aside(shield, care.barred, prefix, tried, kept)
                 kept = _with_room(shield, prefix, tried, kept) if roomy else kept
                 aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, before)
-                values = best_of(tried, kept, motions).robustness
+                values = best_of(tried.motions, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
@@ -189,7 +188,7 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
     if not sure.any():
         sure = judged.feasible_motion & ~risky
     if not sure.any():
-        keeps = best_of(judged.tried, judged.kept, len(risky))
+        keeps = best_of(judged.tried.motions, judged.kept, len(risky))
         sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
         if sure.any():
             rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)
@@ -307,30 +306,14 @@ def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int)
     return None if found is None else tuple(found.translate(shield.task.robot.action_table))
 
 
-def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
-    """J of each action; a terminal one has the highest of the others (docs/architecture.md)."""
-    robot = shield.task.robot
-    if judged is None:
-        return (None,) * len(robot.actions)
+def j_values_of(shield: Shield, judged: Judged) -> Floats:
+    """J of each action [A]; a terminal one has the highest of the others (docs/architecture.md)."""
+    values, terminal = judged.values, shield.task.robot.terminal
     if shield.config.evaluation == "feasibility":
-        values = judged.feasible | robot.terminal if judged.some else judged.feasible
-        return tuple(values.astype(np.float64).tolist())
-    return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))
+        values = judged.feasible.astype(np.float64)
+    return np.where(terminal, values.max(), values)
 
 
-def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
-    if judged is None:
-        return (None,) * len(shield.task.robot.actions)
-    return _as_numbers(judged.robustness)
-
-
-def _as_numbers(values: Floats) -> tuple[float | None, ...]:
+def as_numbers(values: Floats) -> tuple[float | None, ...]:
     """None where nothing was evaluated."""
     return tuple([None if value == -math.inf else value for value in values.tolist()])
-
-
-def feasible_mass_of(conditional: Floats | None, judged: Judged | None) -> float | None:
-    """conditional [A]: as `_Answer` has it."""
-    if conditional is None or judged is None:
-        return None
-    return shaping.feasible_mass(conditional, judged.feasible)

@@ -16,7 +16,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, best_rows, rho_of
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY
@@ -62,9 +62,9 @@ def aim(
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
-    count = len(parts.kind)
-    still, settled, (asked, due) = np.empty(count, np.bool_), np.empty(count), np.empty((2, count), np.int64)
-    now = Open(parts, still, settled, asked, due, prefix.t, leaves, whole, tried.motions, follows)
+    size, count = len(parts.kind), len(shield.task.robot.motions)
+    still, settled, (asked, due) = np.empty(size, np.bool_), np.empty(size), np.empty((2, size), np.int64)
+    now = Open(parts, still, settled, asked, due, prefix.t, leaves, whole, tried.motions, count, follows)
     if before is not None:
         return _aim(shield, care, prefix, now, before.visits, before)
     robust = _aim(shield, care, prefix, now, SATISFIED_ABOVE + care.margin)
@@ -79,23 +79,16 @@ def _aim(
     shield: Shield, care: Care, prefix: Prefix, now: Open, visits: float, before: Aimed | None = None
 ) -> Aimed:
     """`aim`, where a visit that is behind counts if it was more robust than `visits`."""
-    motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + care.margin
-    best = Best(np.empty(motions), np.empty(motions, np.int64))
-    asking = care.noise, care.stride, care.least, care.chance
-    had = _best_asked(now, prefix.known, asking, visits, margin, best) > margin
-
-    def at(early: Ints) -> tuple[Best, bool]:
-        best = Best(np.empty(motions), np.empty(motions, np.int64))
-        return best, _best_open(now, early, margin, best) > margin
-
+    margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
+    best, had = _best_asked(now, prefix.known, asking, visits, margin)
     if before is not None:
         margin = min(margin, SATISFIED_ABOVE + before.margin)
-        best, _ = at(before.early)
+        best, _ = _best_open(now, before.early, margin)
         return before._replace(best=best, kept=best.robustness > margin)
     early = now.asked.copy()
     if not had:
         early = np.zeros_like(early)
-        best, had = at(early)
+        best, had = _best_open(now, early, margin)
         if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
         for of in (early == 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
@@ -103,7 +96,7 @@ def _aim(
             while high - low > 1:
                 middle = (low + high) // 2
                 more = np.where(of, np.minimum(now.asked, middle), early)
-                tighter, had = at(more)
+                tighter, had = _best_open(now, more, margin)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
     margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
@@ -114,8 +107,8 @@ def _aim(
 
 class Open(NamedTuple):
     """The conjuncts at step t: which are still open (K,), above which robustness they are `settled` (K,), how
-    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not. The rest is as
-    in `aim`.
+    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not.
+    motion_count: of the robot's motions. The rest is as in `aim`.
     """
 
     parts: Conjuncts
@@ -127,14 +120,15 @@ class Open(NamedTuple):
     leaves: Floats
     whole: Floats
     motions: Ints
+    motion_count: int
     follows: bool
 
 
 @kernel
 def _best_asked(
-    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: float, margin: float, best: Best
-) -> float:
-    """Fills in `still`, `settled`, `asked` and `due` of `now`, and then writes as `_best_open` does for what
+    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: float, margin: float
+) -> tuple[Best, bool]:
+    """Fills in `still`, `settled`, `asked` and `due` of `now`, and then answers as `_best_open` does for what
     is asked. care: its noise, stride, least and chance. A window keeps half its length.
     """
     parts, still, settled, asked, due, t = now[:6]
@@ -152,12 +146,12 @@ def _best_asked(
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
                 if not low[parts.at[k] - parts.a[k] + i] > settled[k]:
                     due[k] = min(due[k], i + parts.horizon[k] - t)
-    return _best_open(now, asked, margin, best)
+    return _best_open(now, asked, margin)
 
 
 @kernel
-def _best_open(now: Open, early: Ints, margin: float, best: Best) -> float:
-    """Writes the best future of each motion by what is open, and its robustness; the highest of them.
+def _best_open(now: Open, early: Ints, margin: float) -> tuple[Best, bool]:
+    """The best future of each motion by what is open, and whether some motion's keeps the margin.
 
     The way that the robot is on stays its motion's future (`row`) where it keeps enough, though another may
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
@@ -165,7 +159,7 @@ def _best_open(now: Open, early: Ints, margin: float, best: Best) -> float:
     rho = np.empty(now.whole.shape[0])
     rate_open(now.parts, now.still, now.t, now.settled, early, now.leaves, rho)
     rho[~(now.whole > SATISFIED_ABOVE)] = -np.inf
-    best_rows(now.motions, rho, best)
+    best = best_of(now.motions, rho, now.motion_count)
     if now.follows and rho[0] > margin:
         best.row[now.motions[0, 0]] = 0
-    return float(best.robustness.max())
+    return best, bool(best.robustness.max() > margin)
