@@ -141,7 +141,7 @@ def test_what_is_open_has_the_robustness_that_its_definition_says(rule, early):
         rate(view, prefix.known, t, np.ascontiguousarray(walk[:, t + 1 :]), np.empty((1, 0)), rho, leaves)
         still, found = np.empty(len(parts.kind), np.bool_), np.empty(9)
         settled = np.empty(len(still))
-        find_open(parts, prefix.known, t, SATISFIED_ABOVE, still, settled)
+        find_open(parts, prefix.known, t, np.full(len(still), SATISFIED_ABOVE), still, settled)
         assert (settled == SATISFIED_ABOVE).all()
         rate_open(parts, still, t, settled, np.full(len(still), early), leaves, found)
         samples = task.samples(walk)
@@ -198,7 +198,7 @@ def test_a_visit_behind_has_to_have_the_margin_as_long_as_another_can(rule):
         rho, leaves = np.empty(9), np.empty((9, view.tree.size))
         rate(view, prefix.known, t, np.ascontiguousarray(walk[:, t + 1 :]), np.empty((1, 0)), rho, leaves)
         still, settled, found = np.empty(len(parts.kind), np.bool_), np.empty(len(parts.kind)), np.empty(9)
-        find_open(parts, prefix.known, t, MARGIN, still, settled)
+        find_open(parts, prefix.known, t, np.full(len(still), MARGIN), still, settled)
         rate_open(parts, still, t, settled, np.zeros(len(still), np.int64), leaves, found)
         samples, least = task.samples(walk), []
         for part in conjuncts(formula):

@@ -215,6 +215,27 @@ def test_a_margin_is_found_beside_what_was_settled_by_less(synthesise, formula, 
         assert max(kept) == pytest.approx(robustness)
 
 
+@pytest.mark.parametrize(
+    ("formula", "states", "slack", "feasible"),
+    [
+        # x > 0.48 is settled by 0.02 m. Deeper in the last step, y two steps later: one of its three is kept
+        ("F[0,3] x > 0.48 and F[0,7] y > 0.28", [(2, 0, 0)] * 3, 3, [1, 0, 0, 0]),
+        # deeper in three steps, of four; then x < 0.38 in its last step, though any visit leaves it its two
+        ("F[0,5] x > 0.48 and F[0,8] x < 0.38", [(2, 0, 2)] * 2, 2, [1, 1, 1, 1]),
+        # the first can have 0.03 m at most; deeper for the second, then to the third, in the last three steps
+        ("F[0,6] (x > 0.47 and x < 0.53) and F[0,6] y > 0.28 and F[0,6] x > 0.6", [(2, 1, 1)] * 4, 0,
+         [1, 0, 0, 0]),
+    ],
+)  # fmt: skip
+def test_a_visit_is_made_again_where_half_the_slack_of_all_else_is_left(formula, states, slack, feasible):
+    """Each visit by itself: what one cannot have, or how late it is, does not excuse another one."""
+    cells = Cells(formula, None, {})
+    history, careful = [cells.pose(*state) for state in states], Config(margin=0.05, slack=slack)
+    found = decide(make_shield([Everything(cells)], careful), history, EVEN)
+    assert (found.mode, found.margin) == ("shaped", pytest.approx(0.05))
+    assert list(found.j_values[:4]) == feasible
+
+
 def test_a_learned_policy_shares_a_way_that_keeps_the_margin_of_what_is_open():
     """A network that goes ahead always: a turn is undone where ahead settles all that is open."""
     cells = Cells("F[0,9] x > 0.48 and F[0,4] y > 0.28", None, {})

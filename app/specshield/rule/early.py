@@ -77,8 +77,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
         size += each.size
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:8]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
-    last = np.array(owner, np.int64), np.array(seeker, np.int64)
-    parts = Conjuncts._make((below, *columns, plain, *last))
+    parts = Conjuncts._make((below, *columns, plain, *(np.array(of, np.int64) for of in (owner, seeker))))
     same = whole == formula and tree.size == view_of(task, formula).tree.size  # no window is far
     return None if same else view_of(task, whole, True), parts
 
@@ -90,18 +89,19 @@ def _is_plain(part: Formula) -> bool:
 
 @kernel
 def find_open(
-    parts: Conjuncts, known: Floats, t: int, margin: float, still: Bools, settled: Floats
+    parts: Conjuncts, known: Floats, t: int, visits: Floats, still: Bools, settled: Floats
 ) -> Floats:
     """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t.
     Returns the least that each node may have, by x_{0:t}.
 
-    margin: what was sought counts where it is more robust than this, as long as that can be had yet. settled
-    (K,): written, what that is for each conjunct.
+    visits (K,): what was sought counts where it is more robust than this, as long as that can be had yet.
+    settled (K,): written, what that is for each conjunct.
     """
     low, high = known.copy(), known.copy()
     bounds_at(parts.below, t, low, high)
     for k in range(settled.shape[0]):
-        settled[k] = margin if _value(parts, k, parts.a[k], parts.b[k], high) > margin else SATISFIED_ABOVE
+        had = _value(parts, k, parts.a[k], parts.b[k], high) > visits[k]
+        settled[k] = visits[k] if had else SATISFIED_ABOVE
     copy_row(known, low)
     if not _settle(parts, t, settled, low):  # then nothing is settled by less
         settled[:] = SATISFIED_ABOVE

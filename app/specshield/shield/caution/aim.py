@@ -29,7 +29,7 @@ class Aimed(NamedTuple):
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
     than the session's settings ask for; what is asked for beside them is had where it can be. early (K,)
-    [steps]: of each conjunct. visits: the robustness above which a visit that is behind counts.
+    [steps]: of each conjunct. visits (K,): the robustness above which its visits that are behind count.
     """
 
     best: Best
@@ -38,7 +38,7 @@ class Aimed(NamedTuple):
     slack: int
     lowered: bool
     early: Ints = np.zeros(0, np.int64)
-    visits: float = SATISFIED_ABOVE
+    visits: Floats = np.zeros(0)
 
 
 def aim(
@@ -63,39 +63,47 @@ def aim(
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     size, count = len(parts.kind), len(shield.task.robot.motions)
-    still, settled, (asked, due) = np.empty(size, np.bool_), np.empty(size), np.empty((2, size), np.int64)
-    now = Open(parts, still, settled, asked, due, prefix.t, leaves, whole, tried.motions, count, follows)
+    (still, short), settled = np.empty((2, size), np.bool_), np.empty(size)
+    asked, due = np.empty((2, size), np.int64)
+    arrays = still, settled, asked, due, prefix.t, short, leaves, whole, tried.motions
+    now = Open(parts, *arrays, count, follows)
     if before is not None:
-        return _aim(shield, care, prefix, now, before.visits, before)
-    robust = _aim(shield, care, prefix, now, SATISFIED_ABOVE + care.margin)
-    if max(settled.tolist()) <= SATISFIED_ABOVE:  # no visit was made by less
-        return robust
-    any_visit = _aim(shield, care, prefix, now, SATISFIED_ABOVE)
-    enough = min(any_visit.slack, care.least // 2)  # to make a visit again may cost half of the slack
-    return robust if robust.margin >= any_visit.margin and robust.slack >= enough else any_visit
-
-
-def _aim(
-    shield: Shield, care: Care, prefix: Prefix, now: Open, visits: float, before: Aimed | None = None
-) -> Aimed:
-    """`aim`, where a visit that is behind counts if it was more robust than `visits`."""
-    margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
-    best, had = _best_asked(now, prefix.known, asking, visits, margin)
-    if before is not None:
-        margin = min(margin, SATISFIED_ABOVE + before.margin)
+        find_open(parts, prefix.known, prefix.t, before.visits, still, settled)
+        margin = min(care.margin, before.margin) + SATISFIED_ABOVE
         best, _ = _best_open(now, before.early, margin)
         return before._replace(best=best, kept=best.robustness > margin)
+    any_visit = np.full(size, SATISFIED_ABOVE)
+    aimed = _aim(shield, care, prefix, now, any_visit, np.zeros_like(asked))
+    if True not in short.tolist():
+        return aimed
+    # What was visited by less is visited again: all of it, or else each place for which that can be had with
+    # as much margin, and with half of the slack that is asked for of all that is open beside it.
+    places, half, robust = short.copy(), asked // 2, any_visit + care.margin
+    for some in (places, *np.eye(size, dtype=np.bool_)[places]):
+        tighter = _aim(shield, care, prefix, now, np.where(some, robust, aimed.visits), half)
+        if tighter.margin >= aimed.margin and tighter.kept.any():
+            aimed = tighter
+            if some is places:
+                break
+    return aimed
+
+
+def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, sooner: Ints) -> Aimed:
+    """`aim`, where a visit that is behind counts if it was more robust than its conjunct's `visits` (K,), and
+    the slack is not lowered below `sooner` (K,).
+    """
+    margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
+    best, had = _best_asked(now, prefix.known, asking, visits, margin)
     early = now.asked.copy()
     if not had:
-        early = np.zeros_like(early)
-        best, had = _best_open(now, early, margin)
+        best, had = _best_open(now, early := sooner, margin)
         if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
-        for of in (early == 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
-            low, high = int(early[of].max()), int(now.asked[of].max()) + 1
+        for of in (early >= 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
+            low, high = int(early[of].min()), int(now.asked[of].max()) + 1
             while high - low > 1:
                 middle = (low + high) // 2
-                more = np.where(of, np.minimum(now.asked, middle), early)
+                more = np.where(of, np.maximum(np.minimum(now.asked, middle), early), early)
                 tighter, had = _best_open(now, more, margin)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
@@ -107,8 +115,9 @@ def _aim(
 
 class Open(NamedTuple):
     """The conjuncts at step t: which are still open (K,), above which robustness they are `settled` (K,), how
-    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not.
-    motion_count: of the robot's motions. The rest is as in `aim`.
+    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not. short (K,):
+    which have a visit behind that can yet be made again with the margin that it lacks. motion_count: of the
+    robot's motions. The rest is as in `aim`.
     """
 
     parts: Conjuncts
@@ -117,6 +126,7 @@ class Open(NamedTuple):
     asked: Ints
     due: Ints
     t: int
+    short: Bools
     leaves: Floats
     whole: Floats
     motions: Ints
@@ -126,13 +136,15 @@ class Open(NamedTuple):
 
 @kernel
 def _best_asked(
-    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: float, margin: float
+    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: Floats, margin: float
 ) -> tuple[Best, bool]:
-    """Fills in `still`, `settled`, `asked` and `due` of `now`, and then answers as `_best_open` does for what
-    is asked. care: its noise, stride, least and chance. A window keeps half its length.
+    """Fills in `still`, `settled`, `asked`, `due` and `short` of `now`, and then answers as `_best_open` does
+    for what is asked. care: its noise, stride, least and chance. A window keeps half its length.
     """
-    parts, still, settled, asked, due, t = now[:6]
-    noise, stride, least, chance = care
+    (parts, still, settled, asked, due, t, short), (noise, stride, least, chance) = now[:7], care
+    find_open(parts, known, t, np.full(settled.shape[0], margin), still, settled)
+    for k in range(still.shape[0]):
+        short[k] = settled[k] > SATISFIED_ABOVE and (parts.seeker == k).any()
     low = find_open(parts, known, t, visits, still, settled)
     for k in range(still.shape[0]):
         half, due[k], asked[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER, 0

@@ -48,7 +48,8 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
-    find_open(parts, prefix.known, prefix.t, SATISFIED_ABOVE, still, np.empty(len(still)))
+    any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
+    find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
     motions, wait = tried.motions, task.robot.wait_motion
     _chances(parts, still, prefix.t, care.noise, care.stride, care.margin, leaves, rho, motions, wait, values)
     motion_of = task.robot.motion_of
