@@ -106,4 +106,4 @@ def test_surprises_do_not_use_up_the_slack(seed):
         slack.append(decision.slack)
         history.append(step(real, *history[-1], int(STRETCH.motion_of[decision.action])))
     assert decision.spec_status == "satisfied"
-    assert min(slack[1:]) >= 10
+    assert min(slack[1:]) >= 9

@@ -25,9 +25,7 @@ from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
-# [steps] Ways are asked for with so much less slack for V, in such strides with more, and with so much more
-# after a surprise. Chosen by hand.
-LESS = 4
+LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
 
 
 class Situation(NamedTuple):
@@ -155,7 +153,7 @@ def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[
         chancy = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
         return chancy if some else [], True
     if unsure and t > 0 and not care.on_way and most < care.least:  # a surprise may have cost slack
-        return [min(most + LESS, care.least), most + 1], True
+        return [most + 1], True
     return [most] if some and most > 0 and care.on_way else [], False
 
 
