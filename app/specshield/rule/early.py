@@ -94,8 +94,8 @@ def find_open(
     """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t.
     Returns the least that each node may have, by x_{0:t}.
 
-    visits (K,): what was sought counts where it is more robust than this, as long as that can be had yet.
-    settled (K,): written, what that is for each conjunct.
+    visits (K,): a visit behind counts if its robustness is above this, as long as one can yet be so robust.
+    settled (K,): written, above which robustness each conjunct's visits count now.
     """
     low, high = known.copy(), known.copy()
     bounds_at(parts.below, t, low, high)
@@ -113,8 +113,8 @@ def find_open(
 
 @leaf
 def _settle(parts: Conjuncts, t: int, settled: Floats, buffer: Floats) -> bool:
-    """Of the leaves to step t, in `buffer` (size,), what is settled asks for no margin any more, in place.
-    settled (K,): as `find_open` has it. Whether something sought is settled by less than that.
+    """Each leaf to step t in `buffer` (size,) becomes inf where it counts, -inf where it does not hold; what
+    holds and does not count keeps its value. Returns whether there is any. settled (K,): as in `find_open`.
     """
     less = False
     for n in range(parts.below.leaf_at.shape[0]):

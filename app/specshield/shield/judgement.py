@@ -144,9 +144,9 @@ def _with_room(shield: Shield, prefix: Prefix, tried: Futures, kept: Floats) -> 
 
 
 def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[Sequence[int], bool]:
-    """By how many steps earlier ways are asked for, beside the first futures, which have `most` steps of
-    slack. And whether of every motion, or of those alone that keep the rule and not what is asked of it;
-    some: whether there are any.
+    """By how many steps earlier policies are asked for more ways; the first have `most` steps of slack. Also
+    whether they are asked for each motion, or only for those that keep the rule but not what is asked beside
+    it. some: whether there are such motions.
     """
     unsure = shield.config.uncertainty is not None
     if unsure and shield.config.threshold_over == "episode":  # it weighs ways with any slack
