@@ -30,7 +30,8 @@ import msgpack
 import numpy as np
 
 from specshield.service.schemas.steps import StepRequest
-from specshield.sim.service import _free_port, follow_parent, own_server
+from specshield.sim.service import follow_parent, own_server
+from tests.serving import free_port
 
 CASE, HEADING = "case1", 0.0
 Ask = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
@@ -216,7 +217,7 @@ def _run(
 
 def measure(robots: list[int], steps: int, rounds: int, seed: int, ways: list[str]) -> list[dict[str, Any]]:
     rows = []
-    port = _free_port()
+    port = free_port()
     arguments = [sys.executable, "-m", "benchmarks.step_cost", "--serve-bare", str(port)]
     with own_server() as url, subprocess.Popen(arguments, preexec_fn=follow_parent) as bare:
         server = next(pid for pid in family(os.getpid()) if "specshield.cli" in _command(pid))
