@@ -24,19 +24,19 @@ ThresholdOver = Literal["step", "episode"]
 
 @dataclass(frozen=True)
 class Config:
-    """A session's settings. Raises InputError or Unsupported with the field's path.
+    """A session's settings. Raises InputError with the field's path.
 
-    threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
-    > margin [m]. slack: J asks for what has a deadline this many steps early. Where the margin or the slack
-    cannot be had, J asks for as much of it as can be. max_steps: None is max(600, T + 1). seed: of the drawn
-    actions.
+    threshold: delta. It is in (0, 1] if `evaluation` is "feasibility", any number of metres if that is
+    "robustness". margin: J asks for rho > margin [m]. slack: J asks for everything that has a deadline this
+    many steps early. Where no future has the margin or the slack, J asks for as much of it as some future
+    has. max_steps: None stands for max(600, T + 1). seed: of the draws of actions.
 
-    uncertainty: None takes f for exact, as the paper does; else margin and slack follow from what is known
-    and learned of the robot, and those given are the least that is kept. threshold_over: whether delta holds
-    at each `step` or over the whole `episode`. learn_map: whether a motion that stops short marks what it
-    ran into. map_memory: for how many steps an `occupied` point stays [steps]; None: for ever. any_signal: J
-    asks that the rule be kept whatever the signals do, where some action has that; else, and without it, that
-    it be kept if they stay as they are, as in the paper.
+    uncertainty: None takes f for exact, as the paper does. Otherwise margin and slack follow from what the
+    session knows and learns of its robot, and the two settings above are lower limits. threshold_over:
+    whether delta holds at each `step` or over the whole `episode`. learn_map: whether a motion that stops
+    short marks what it ran into. map_memory: after how many steps an `occupied` point is forgotten; None:
+    never. any_signal: J asks that the rule be kept whatever the signals do, if some action allows that.
+    Otherwise, and without this setting, signals are taken to keep their values, as in the paper.
     """
 
     threshold: float = 1.0
@@ -98,7 +98,7 @@ class Shield:
 
 
 def check_preferring(config: Config) -> None:
-    """Raises InputError for settings that a preference does not go with."""
+    """Raises InputError for settings under which a session does not choose within S_t alone."""
     if config.evaluation != "feasibility" or config.threshold != 1.0:
         raise InputError(
             "a preference chooses within the feasible set, and these settings leave mass outside it",
@@ -126,19 +126,21 @@ def make_shield(
     return Shield(task, tuple(proposers), config or Config(), body, view, preference)
 
 
-# A pose, and a motion that led nowhere from it; ~motion where it did nothing and may only have slipped.
+# A pose, and the index of a motion that led nowhere from it. The index is inverted (~motion) if the motion
+# did nothing, but may only have slipped.
 Stuck = tuple[float, float, float, int]
 
 
 class Carry(NamedTuple):
-    """What one decision hands to the next: each motion's next pose and its certified continuation.
+    """What one decision hands to the next.
 
-    next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
-    memory: of the session's preference. residuals: what is known of the robot by now (uncertainty.py).
-    threshold_left: what is left of a threshold over the episode. learned: what the session's map has that the
-    policy's has not (world/learned.py). action: the one that was drawn, which the caller may have executed.
-    way: where a rule begins to hold, a continuation from there to its horizon that no policy found. stuck,
-    here: as `Taught` has them.
+    next_poses [M, 3]: where f leads by each motion. witnesses: for each motion the T - t - 1 motions that
+    follow it, one a byte; None if it is not certified. memory: of the session's preference. residuals: what
+    the session has seen of its robot (`Seen` in caution/experience.py). threshold_left: what is left of a
+    threshold over the episode. learned: what the session has learned of its map (`Taught.to_bytes`). action:
+    the one that was drawn, which the caller may have executed. way: at the step at which a rule begins to
+    hold, motions from there to its horizon that a search found and no policy; one a byte. stuck, here: see
+    `Taught`.
     """
 
     t: int
@@ -158,9 +160,9 @@ class Carry(NamedTuple):
 class Explanation:
     """Why an action is forbidden.
 
-    conjunct: the part of the formula that its best future does not keep. robustness: of that part on it [m].
-    late_by: by how many steps the future comes too late, None where time is not what is missing. detail: what
-    else is to be said to a person, None where that is all.
+    conjunct: the part of the formula that its best future does not keep. robustness: of that part along that
+    future [m]. late_by: by how many steps the future comes too late; None if more time would not help.
+    detail: the reason in words; None if there is nothing to add.
     """
 
     conjunct: str
@@ -170,20 +172,21 @@ class Explanation:
 
 
 class Decision(NamedTuple):
-    """The answer to one step; A actions. The fields are those of the HTTP contract.
+    """The answer to one step, for A actions. The fields are those of the HTTP contract.
 
     distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness
-    is rho of the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t), kl
-    [nats]: of the answer from the prior, None where it leaves the prior's support or no logits were sent.
-    next_poses [A, 3]. residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None
-    where there was none. witness: the action indices that follow `action`; witnesses: the same for every
-    action. warnings: what did not go as it should, such as a policy that was not used.
+    is rho of the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t). kl:
+    of the answer from the prior [nats]; None if the answer leaves the prior's support or no logits were sent.
+    next_poses [A, 3]: where f leads by each action. residual: how far x_t is from the nearest pose that the
+    last decision foresaw, in metres and radians; None if there is no such pose. witness: the actions that
+    follow `action`, by index; witnesses: the same for every action. warnings: what did not go as it should,
+    such as a policy that was not used.
 
-    margin [m], slack [steps]: what J asked for at this step. threshold_left: delta of the next step.
-    map_revision: how often the session's map has changed. any_signal: whether every action that J allows has
-    a future that keeps the rule whatever the signals do from here on; None where that was not asked, or the
-    rule reads no signals. explanations: one an action, None where it is allowed; empty where they were not
-    asked for.
+    margin [m], slack [steps]: what J asked for at this step. threshold_left: the threshold of the next step,
+    as a share of the best chance that it has. map_revision: how often the session's map has changed.
+    any_signal: whether every action that J allows has a future that keeps the rule whatever the signals do
+    from here on; None if that was not asked or the rule reads no signals. explanations: one an action, None
+    for an action that is allowed; empty if they were not asked for.
     """
 
     t: int

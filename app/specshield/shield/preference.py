@@ -13,8 +13,8 @@ from specshield.arrays import Bools, Floats
 
 
 class Preference(Protocol):
-    """A preference for one task, prepared. It keeps no state: what it has learned of a session is its memory,
-    which the session stores with the step.
+    """A preference, prepared for one task. The object keeps no state: what it learns of a session is a
+    *memory* of bytes, which the session stores with each step.
     """
 
     def begin(self) -> bytes:

@@ -43,20 +43,23 @@ class Proposer(Protocol):
     def task(self) -> Task: ...
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
+        """Futures that may keep the rule, by more than `margin` if possible.
+
+        history [t + 1, 3]: x_0..x_t, with t < T; signals {name: [t + 1]}; margin: of robustness [m].
+        """
         ...
 
 
 def joined(*proposals: Proposal) -> Proposal:
-    """The futures of all of them; what the first prefers is preferred."""
-    if len(proposals) == 1:
-        return proposals[0]
+    """The futures of all proposals as one proposal, which prefers what the first one prefers."""
     return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)
 
 
 def adapted(proposer: Proposer, how: str, *told: object) -> Proposer:
-    """What its method `how` returns, `on_body` for example; itself where it has none. Where that raises, a
-    proposer that raises the same when it is asked: so the answer says why the policy was not used.
+    """The copy of a proposer that its method `how` returns, such as `on_body` (CONTRIBUTING.md lists them).
+
+    A proposer without that method is returned itself. If the method raises, the result is a proposer that
+    raises the same error when it is asked, so that the answer says why the policy was not used.
     """
     try:
         found: Proposer = getattr(proposer, how)(*told) if hasattr(proposer, how) else proposer
@@ -88,8 +91,9 @@ def ask(
 ) -> tuple[Proposal | None, str | None]:
     """Asks a proposer; returns its proposal and None, or None and a sentence that says why it was not used.
 
-    Each of `least` rows or more has to hold `steps` motions, all below `count`. The proposer gets copies of
-    the history and the signals, and its motions are copied: nothing that it does later reaches the decision.
+    A proposal needs at least `least` rows of `steps` motions, each motion below `count`. The proposer gets
+    copies of the history and the signals, and its motions are copied, so that nothing which it does later
+    changes the decision.
     """
     try:
         name = str(proposer.id)[:80]

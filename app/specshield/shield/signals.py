@@ -1,9 +1,10 @@
 """What is feasible whatever the signals do.
 
-J takes signals to hold their last value, as the paper does. Here they are at their worst from x_{t+1} on
-(rule/worst.py): an action that is feasible then has a witness that keeps the rule under any signals. So has
-what is left of the witness after the next step, whatever the signals were at it. So once some action is
-feasible in this sense, some action is at every step of the episode.
+J takes signals to keep their last value, as the paper does. Here the signals are taken to be at their worst
+from x_{t+1} on (rule/worst.py). An action that is feasible under the worst signals has a witness that keeps
+the rule under any signals. What is left of that witness after the next step keeps the rule too, whatever the
+signals were at that step. So once some action is feasible in this sense, some action is so at every later
+step of the episode.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from specshield.stl import SATISFIED_ABOVE
 
 
 def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged, bool]:
-    """What the futures say of each action, the shield and the situation as they were judged, and whether
-    what is feasible is so whatever the signals do. Where nothing is, they are taken to stay as they are.
+    """Judges the actions with the signals at their worst or, if no action is feasible then, with the signals
+    that keep their last values.
+
+    Returns the shield and the situation that were judged, what the futures say of each action, and whether
+    the signals were at their worst.
     """
     if shield.config.any_signal and now.status == "pending":
         found = _judged_at_worst(shield, now)
@@ -37,8 +41,8 @@ def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation
 def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | None = None) -> bool | None:
     """Whether some action at x_t has a future that keeps the rule whatever the signals are at x_t and after.
 
-    poses [t + 1, 3]; signals {name: [t]}: those before x_t, whose own come with its step. None where that is
-    not asked, or the rule reads no signals.
+    None if the session does not ask that, or the rule reads no signals. poses [t + 1, 3]; signals {name:
+    [t]}: those before x_t, since the signals at x_t are sent with its step.
     """
     task = shield.task
     if not shield.config.any_signal or not task.signals:
@@ -57,7 +61,9 @@ def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | No
 
 
 def _judged_at_worst(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged] | None:
-    """None where no action is feasible. A proposer that has `foreseeing` plans for the signals at worst."""
+    """The first three results of `judged_by_signals`, with the signals at their worst; None if no action is
+    feasible then. Proposers that have `foreseeing` plan for these signals.
+    """
     held = worst_signals(shield.task)
     if held is None:
         return None

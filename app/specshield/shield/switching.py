@@ -13,8 +13,8 @@ def switch(
 ) -> None:
     """Checks that the rule of `shield` can be kept from x_t on, as the next decision will see it.
 
-    history [t + 1, 3], signals: since the step from which the rule's windows count. carry: what the next
-    decision will be given. elsewhere: whether the map or the robot is another than before; x_t is then
+    history [t + 1, 3], signals {name: [t + 1]}: since the step from which the rule's windows count. carry:
+    what the next decision will be given. elsewhere: whether the map or the robot has changed; x_t is then
     checked as an initial pose is. Raises PoseError, InfeasibleSwitch.
     """
     if elsewhere:
