@@ -14,7 +14,7 @@ from specshield.shield.judgement import Judged
 
 
 class Answer(NamedTuple):
-    """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
+    """conditional [A]: the model's log-probabilities given that it does not end; None if it surely ends."""
 
     distribution: Floats
     mode: Mode
@@ -31,10 +31,11 @@ def answer_of(
     chance: Floats | None,
     left: float,
 ) -> Answer:
-    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
+    """Steps 4 to 6 of Algorithm 1. A terminal action keeps exactly its prior mass, and has none in
+    `completion`.
 
-    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities. chance [A],
-    left: of a threshold over the episode (threshold.py).
+    weights [A]: a preference's log-weights, which are added to the model's log-probabilities inside S_t.
+    chance [A], left: V and d_t / V* of a threshold over the episode (caution/threshold.py).
     """
     terminal, any_feasible = shield.task.robot.terminal, judged.some
     said: Reason | None = "margin_unattainable" if judged.aimed.lowered else None
@@ -53,7 +54,7 @@ def answer_of(
         attainable = bool(judged.values.max() >= config.threshold)
     elif chance is not None and chance.max() > 0.0:
         shaped = None
-        if left > 1.0 - 1e-9:  # all that can be had is asked for: of what is as good, S_t goes first
+        if left > 1.0 - 1e-9:  # the best chance is asked for: of the actions that have it, those in S_t
             shaped = shaping.restrict(conditional, judged.feasible & (chance >= chance.max()))
         if shaped is None:
             shaped = shaping.tilt(conditional, chance, left * float(chance.max()))
@@ -69,7 +70,7 @@ def answer_of(
 
 
 def unmodified(shield: Shield, log_prior: Floats | None) -> Answer:
-    """The prior; without logits there is nothing left to do: `end`, or else the first action."""
+    """The prior. Without logits nothing is left to do: `end`, or the first action if there is no `end`."""
     if log_prior is not None:
         return Answer(exp(log_prior), "prior", None)
     idle = np.zeros(len(shield.task.robot.actions))

@@ -28,7 +28,7 @@ POSES_A_METRE = 1e3  # [1/m, 1/rad] poses that agree when rounded to this grid c
 
 
 class Layer(NamedTuple):
-    """The poses that are so many steps from x_t.
+    """Poses that are the same number of steps from x_t.
 
     pose [N, 3]; root [N]: the first motion of the way to each; motion [N]: the last one; parent [N]: the row
     of the layer before that it comes from.
@@ -113,7 +113,9 @@ def spread(body: Body, poses: Floats) -> Floats:
 
 
 def holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
-    """By how much all formulas whose window holds step t would hold at each pose, [N]; inf for none."""
+    """The least robustness, at each pose [N], of the children of all formulas whose window holds step t; inf
+    if no window does.
+    """
     least = np.full(len(poses), np.inf)
     now = {name: values[-1:] for name, values in prefix.signals.items()}
     samples = prefix.task.samples(poses[:, None], now)

@@ -25,14 +25,16 @@ from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
-LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
+# [steps] For V, ways with this much less slack are asked for too, and ways with more slack in steps of this
+# size (`_sooner`). Chosen by hand.
+LESS = 4
 
 
 class Situation(NamedTuple):
     """What the actions at one step are judged by.
 
-    prefix: as the whole formula sees it. tail: the witness that the robot follows, one motion a byte. status:
-    what the prefix decides. care: what J asks for beyond satisfaction.
+    prefix: for the whole formula. tail: what is left of the witness that the robot follows, one motion a
+    byte. status: what the prefix decides. care: what J asks for beyond satisfaction.
     """
 
     prefix: Prefix
@@ -45,16 +47,16 @@ class Judged(NamedTuple):
     """The actions' futures at one step."""
 
     tried: Futures
-    part: Prefix  # as what can still be kept sees it
-    kept: Floats  # [N], rho of that along each future; -inf where it is set aside
-    aimed: Aimed  # how much can be had of what is asked for
+    part: Prefix  # for the part of the formula that can still be kept
+    kept: Floats  # [N], rho of that part along each future; -inf for a future that is set aside
+    aimed: Aimed  # how much of the margin and the slack can be had
     feasible_motion: Bools  # [M]
     feasible: Bools  # [A], S_t; false for a terminal action
-    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf where nothing was evaluated
+    values: Floats  # [A], J if real-valued: rho of that part; -inf where nothing was evaluated
     robustness: Floats  # [A], rho of the whole formula along the same trajectories; -inf likewise
-    completion: int
-    vain: bool  # whether no future keeps the rule without what led nowhere before
-    left_out: Bools  # [M]: only futures with that keep the rule, and others without it do
+    completion: int  # the action to execute if the model's task is over
+    vain: bool  # whether every future that keeps the rule makes a motion that led nowhere before
+    left_out: Bools  # [M]: motions that are set aside since only such futures of theirs keep the rule
 
     @property
     def some(self) -> bool:
@@ -71,7 +73,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         clear = tuple(policy for each, policy in both if policy is not each)
         shield = replace(shield, proposers=(*shield.proposers, *clear))
     motions = len(robot.motions)
-    # On a guess about the map, one of several, what cannot be kept is not asked for with a margin as well.
+    # Several guesses about the map may be tried in one decision, so each is tried without a margin first.
     margins = (0.0,) if care.guess and not violated else (asked, 0.0)
     tried = futures(prefix, shield.body, shield.proposers, tail, margins)
     if asked not in margins and tried.rho.max() > SATISFIED_ABOVE:
@@ -93,7 +95,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         apart = _with_room(shield, prefix, tried, kept)
         roomy = max(apart.tolist()) > SATISFIED_ABOVE
         had = aim(shield, care, part, tried, apart, leaves, follows) if roomy else None
-        if had and had.slack < care.least // 2:  # room may cost half of the slack that is asked for
+        if had and had.slack < care.least // 2:  # room may cost up to half of the slack that is asked for
             none = aim(shield, care, part, tried, kept, leaves, follows)
             roomy, had = (True, had) if had.slack >= none.slack else (False, none)
         kept = apart if roomy else kept
@@ -130,26 +132,29 @@ def judge(shield: Shield, now: Situation) -> Judged:
 
 
 def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
-    """`kept` [N], and -inf for the futures that go by what led nowhere before. barred: as `Care` has it."""
-    # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
+    """`kept` [N], with -inf for the futures that make a motion from where it led nowhere before. barred: see
+    `Care`.
+    """
+    # If no policy can avoid such motions, a future that makes one only later on still counts.
     whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
     goes = in_vain(barred, prefix.poses[-1], tried.motions, tried.poses, whole)
     return np.where(goes, -np.inf, kept)
 
 
 def _with_room(shield: Shield, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
-    """`kept` [N], and -inf for the futures that come too near to something for a larger robot."""
+    """`kept` [N], with -inf for the futures that come too near to an obstacle for a larger robot."""
     room = has_room(widened(shield.body), prefix.poses[-1], tried.motions, tried.poses)
     return np.where(room, kept, -np.inf)
 
 
 def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[Sequence[int], bool]:
-    """By how many steps earlier policies are asked for more ways; the first have `most` steps of slack. Also
-    whether they are asked for each motion, or only for those that keep the rule but not what is asked beside
-    it. some: whether there are such motions.
+    """For deadlines how many steps earlier the policies are asked for more ways, and whether they are asked
+    for each motion, or only for those that keep the rule without the margin and the slack.
+
+    most: the slack that was found so far. some: whether there are motions of the latter kind.
     """
     unsure = shield.config.uncertainty is not None
-    if unsure and shield.config.threshold_over == "episode":  # it weighs ways with any slack
+    if unsure and shield.config.threshold_over == "episode":  # V weighs ways with any slack
         chancy = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
         return chancy if some else [], True
     if unsure and t > 0 and not care.on_way and most < care.least:  # a surprise may have cost slack
@@ -160,9 +165,8 @@ def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[
 def _in_time(
     shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int, wanted: Bools
 ) -> Futures:
-    """`tried`, and the futures that policies propose for deadlines so many steps earlier, of the motions
-    `wanted` [M]. They may meet them where a way that is just in time for the rule does not. The `wanted` ones
-    keep the rule already: what has no future that keeps it is not looked at again.
+    """`tried`, and the futures that policies propose for deadlines `steps` earlier, after the first motions
+    `wanted` [M] alone. Such a future may be in time where one that is just in time for the rule is not.
     """
     rows, warnings = list[Ints](), list[str]()
     for proposer in shield.proposers:
@@ -177,8 +181,11 @@ def _in_time(
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Judged:
-    """Without the motions [M] that are doubtful, unless no other is feasible; then without those of them that
-    are risky, unless no other keeps the rule, with however little slack and margin.
+    """`judged` without the motions that are `doubtful` [M].
+
+    If no other motion is feasible, only those that are also `risky` [M] are left out. If that leaves none
+    either, the motions that keep the rule with less margin and slack and are not doubtful are feasible
+    instead. If there are none of these, nothing is left out.
     """
     if True not in doubtful.tolist():
         return judged
@@ -207,7 +214,9 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
 def _by_action(
     motion_of: Ints, feasible: Bools, values: Floats, row: Ints, rho: Floats
 ) -> tuple[Bools, Floats, Floats]:
-    """`Judged.feasible`, `values` and `robustness`, each [A], out of what is known of the motions."""
+    """`Judged.feasible`, `values` and `robustness`, each [A], from what is known of the motions: feasible,
+    values, row [M], and rho [N] of the futures.
+    """
     count = motion_of.shape[0]
     all_feasible, all_values = np.zeros(count, np.bool_), np.full(count, -np.inf)
     robustness = np.full(count, -np.inf)
@@ -221,10 +230,10 @@ def _by_action(
 
 
 def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Prefix]:
-    """What can still be kept of a violated formula: futures, and the prefix as that sees it.
+    """The part of a violated formula that can still be kept: futures, and the prefix for that part.
 
     Conjuncts that cannot be kept any more are dropped. A broken G can still be enforced from a later step on.
-    These are tried in turn, and the first that some future keeps is what is kept:
+    The following parts are tried in turn, and the first that some future keeps is chosen:
 
     1. all other conjuncts, and each broken G from the first step on that can be kept, the next one at most;
     2. the same, each broken G from the earliest step at which the robot can be out of the forbidden place;
@@ -277,7 +286,8 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
 
 @kernel
 def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
-    """Which motions keep the margin asked for, or else the largest there is; whether it was lowered.
+    """Which motions keep the margin `asked` [m] or, if none does, have the largest margin; whether it was
+    lowered so.
 
     robustness [M]: of each motion's best future.
     """
@@ -289,7 +299,9 @@ def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
 
 
 def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:
-    """Each motion's certified continuation, as the motions that follow it."""
+    """Each motion's certified continuation: the motions that follow it, one a byte; None for a motion that is
+    not feasible.
+    """
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
     motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
@@ -299,6 +311,7 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
+    """The certified continuation of an action, as action indices."""
     motion = int(shield.task.robot.motion_of[action])
     found = certified[motion] if motion >= 0 else None
     return None if found is None else tuple(found.translate(shield.task.robot.action_table))
@@ -313,5 +326,5 @@ def j_values_of(shield: Shield, judged: Judged) -> Floats:
 
 
 def as_numbers(values: Floats) -> tuple[float | None, ...]:
-    """None where nothing was evaluated."""
+    """The values as numbers; None in place of -inf, where nothing was evaluated."""
     return tuple([None if value == -math.inf else value for value in values.tolist()])

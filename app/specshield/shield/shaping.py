@@ -30,7 +30,7 @@ def log_softmax(logits: Floats) -> Floats:
 
 
 def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -> Floats | None:
-    """The model's log-probabilities [A]; None where it is over and has none. Raises LogitsError."""
+    """The model's log-probabilities [A]; None without logits once its task is done. Raises LogitsError."""
     n = len(robot.actions)
     if logits is None:
         if main_task_done:
@@ -55,7 +55,9 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
 
 @leaf
 def _wrong(logits: Floats) -> int:
-    """The first that is NaN or +infinity, else -1, or how many there are where all are -infinity."""
+    """The index of the first logit that is NaN or +infinity; how many logits there are if all are -infinity;
+    else -1.
+    """
     ruled_out = 0
     for i in range(logits.shape[0]):
         if math.isnan(logits[i]) or logits[i] == math.inf:
@@ -87,7 +89,9 @@ def conditional(log_prior: Floats, allowed: Bools) -> Floats | None:
 
 @kernel
 def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
-    """`body`, for if the model does not end, with the prior's own mass on what ends its task. Shapes (A,)."""
+    """The whole distribution: `body` given that the model does not end, and the prior's own mass on terminal
+    actions. Shapes (A,).
+    """
     shares: Floats = (1.0 - ending) * body * ~terminal + np.exp(log_prior) * terminal
     return shares
 
