@@ -30,10 +30,10 @@ NOT_FINITE = "the formula's arithmetic is not finite along some futures; these c
 
 
 class Prefix(NamedTuple):
-    """What was driven, and what it says of a formula: rho lies in [low, high] however it goes on.
+    """What was driven, and what it says of a formula: rho lies in [low, high] however the robot goes on.
 
-    poses [t + 1, 3], t = len(poses) - 1; signals {name: [..t + 1]}; rows [t + 1, S]: the same as an array.
-    held [1, S]: what the signals are taken to hold from step t + 1 on.
+    poses [t + 1, 3], t = len(poses) - 1; signals {name: [at most t + 1]}; rows [t + 1, S]: the signals as an
+    array. held [1, S]: the values that the signals are taken to have from step t + 1 on.
     """
 
     task: Task
@@ -57,7 +57,7 @@ class Prefix(NamedTuple):
         return self.task.horizon - self.t
 
     def of(self, formula: Formula, view: View | None = None) -> Prefix:
-        """The same prefix as another formula sees it, a part of the task's own. view: of the formula."""
+        """The same prefix for another formula, a part of the task's own; view: that of the formula."""
         view = view or view_of(self.task, formula)
         seen = prefix_of(self.task, formula, view, self.poses, self.signals)
         return seen._replace(held=self.held)
@@ -72,13 +72,13 @@ class Prefix(NamedTuple):
 
     @property
     def foreseen(self) -> Signals:
-        """The signals to step t, and once more what they are taken to hold from then on."""
+        """The signals to step t, and one more sample: the value that they are taken to keep from then on."""
         rows = np.concatenate([self.rows, self.held])
         return {name: rows[:, i] for i, name in enumerate(self.task.signals)}
 
 
 def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: Signals) -> Prefix:
-    """The prefix as `formula` sees it, the task's own or a part of it; view: that of the formula.
+    """The prefix for `formula`, which is the task's own or a part of it; view: that of the formula.
 
     Raises SampleError where the formula's arithmetic is not finite on it.
     """
@@ -94,10 +94,10 @@ def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: 
 class Futures(NamedTuple):
     """The futures that were tried at one step, several a motion, as the shield itself simulated them.
 
-    motions [N, T - t]: each begins with the motion it is for. poses [N, T - t, 3]: where they lead. rho [N]:
-    of each joined to the prefix, -inf where it was given up on the way. leaves [N, size]: of the
-    formula, along each that was not. preferred: what the first proposer would do itself. warnings: which
-    proposers were not used and why.
+    motions [N, T - t]: a future belongs to its first motion. poses [N, T - t, 3]: where they lead. rho [N]:
+    of each future joined to the prefix; -inf if its simulation was given up. leaves [N, size]: the values of
+    the formula's leaves along each future that was not given up. preferred: the motion that the first
+    proposer would make itself. warnings: which proposers were not used and why.
     """
 
     motions: Ints
@@ -113,14 +113,14 @@ def futures(
 ) -> Futures:
     """Every future worth trying from x_t, t < T: the witness's tail, then what each proposer proposes.
 
-    tail: motions from x_t to the horizon, one a byte, T - t of them, simulated anew from the pose there is.
-    margins: each proposer is asked for ways with each of them.
+    tail: T - t motions from x_t to the horizon, one a byte; they are simulated anew from the robot's pose.
+    margins: each proposer is asked for futures with each of them.
     """
     count, rows, warnings = len(prefix.task.robot.motions), list[Ints](), list[str]()
     if tail is not None and len(tail) == prefix.steps:
         rows.append(np.frombuffer(tail, np.uint8).astype(np.int64)[None])
     preferred = None
-    for margin in dict.fromkeys(margins):  # what cannot be had with a margin may be without
+    for margin in dict.fromkeys(margins):  # where no future has a margin, one without it may keep the rule
         for proposer in proposers:
             proposal, wrong = ask(proposer, prefix.poses, prefix.signals, margin, count, prefix.steps)
             if proposal is None:
@@ -139,8 +139,10 @@ def futures(
 def simulated(
     prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
 ) -> Futures:
-    """The futures of these motions, [n, T - t] each, all within range: simulated and judged in one pass."""
-    motions = np.concatenate(rows) if len(rows) > 1 else [*rows, np.empty((0, prefix.steps), np.int64)][0]
+    """The futures of these motions, simulated and judged in one pass. rows: arrays [n, T - t] of motions,
+    which have been checked to be in range.
+    """
+    motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows])
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.tree.size))
     violated = prefix.high <= SATISFIED_ABOVE  # then parts of the rule are judged, on every row as a whole
@@ -152,14 +154,14 @@ def simulated(
 
 
 def together(tried: Futures, more: Futures) -> Futures:
-    """Both, as `more` prefers."""
+    """The futures of both; `more` says which motion is preferred."""
     arrays = (np.concatenate(both) for both in zip(tried[:4], more[:4], strict=True))
     said = tuple(dict.fromkeys([*tried.warnings, *more.warnings]))
     return Futures._make((*arrays, more.preferred, said))
 
 
 def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:
-    """The robustness (N,) of futures, poses [N, T - t, 3], by another formula, and its leaves (N, size)."""
+    """rho (N,) of the prefix's formula along futures, poses [N, T - t, 3], and its leaves (N, size)."""
     values, leaves = np.empty(len(poses)), np.empty((len(poses), prefix.view.tree.size))
     rate(prefix.view, prefix.known, prefix.t, poses, prefix.held, values, leaves)
     return np.where(np.isnan(values), -np.inf, values), leaves
@@ -192,7 +194,7 @@ def _simulate_and_rate(
     tree, steps, finite = view.tree, motions.shape[1], True
     values, stack, buffer = np.empty(value_count(view, held)), np.empty(STACK_SIZE), np.empty(tree.size)
     best = np.full(motion_count(body), -np.inf)
-    # Most rows come onto the way of another from the very same pose: there f has been computed already.
+    # Most rows join the way of an earlier row at the very same pose, from where f has been computed already.
     met = np.full(1 << math.ceil(math.log2(SLOTS * steps)), -1, np.int64)
     for f in range(motions.shape[0]):
         first, row = motions[f, 0], poses[f]
@@ -245,7 +247,7 @@ class Best(NamedTuple):
 
 @kernel
 def best_of(motions: Ints, values: Floats, count: int) -> Best:
-    """Of each of `count` motions, the future with the highest of `values` (N,), the lowest row on ties.
+    """For each of `count` motions, the future with the highest of `values` (N,); on ties, the lowest row.
     motions [N, T - t]: of the futures.
     """
     best = Best(np.full(count, -np.inf), np.full(count, -1))
