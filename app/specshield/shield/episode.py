@@ -1,7 +1,7 @@
-"""Algorithm 1 as a pure function: history and logits in, a decision out. It keeps no state of its own.
+"""Algorithm 1 as a pure function: history and logits in, a decision out.
 
-The robot's history, and what the last decision handed on (its `Carry`), decide everything; so a decision can
-be made anywhere, and made again.
+Beside these, a decision depends only on what the last decision handed on (its `Carry`). So any process can
+make a decision, and make it again with the same result.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ Explainer = Callable[[Shield, Prefix, Judged | None, Bools], tuple[Explanation |
 def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> None:
     """Checks that an episode can begin at `pose` (x, y, theta): some first action has a satisfying future.
 
-    way: one that no policy knows, as `Carry` has it.
-    Raises PoseError for a pose that is not finite, outside the map or in collision, else InfeasibleStart.
+    way: one more future to try, see `Carry`. Raises PoseError for a pose that is not finite, outside the map
+    or in collision, else InfeasibleStart.
     """
     try:
         history = _history([pose])
@@ -113,9 +113,9 @@ def decide(
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
     task is over; signals {name: [t + 1]}; carry: what the last decision handed on; witnesses: give every
-    action's; occupied, free [n, 2]: what the robot's sensors see of the map now; explain: what says of each
-    action that is forbidden why it is (reasons/explanation.py). Raises LogitsError for logits that are
-    missing, NaN, +inf, all -inf or of the wrong number.
+    action's; occupied, free [n, 2]: points where the robot's sensors see an obstacle, or none, now [m];
+    explain: says why each forbidden action is forbidden (reasons/explanation.py). Raises LogitsError for
+    logits that are missing, NaN, +inf, all -inf or of the wrong number.
     """
     task, robot = shield.task, shield.task.robot
     poses = _history(history)
@@ -124,7 +124,7 @@ def decide(
     taught, said = teach(shield, carry, poses, occupied, free)
     said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)[taught.here :]), *said)
     told, shield = shield, on_map(shield, taught.map, barred=taught.barred)
-    places = np.empty((len(robot.motions) + 1, 3))  # where each motion leads, and x_t, where what ends does
+    places = np.empty((len(robot.motions) + 1, 3))  # where each motion leads; last x_t, where `end` leads
     nexts, places[-1] = places[:-1], poses[-1]
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses, task.horizon - t, shield.body)
@@ -137,7 +137,7 @@ def decide(
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = verdict_between(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
-    margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
+    margin_decided = prefix.low > asked or prefix.high <= asked  # it is kept, or lost, whatever follows
 
     withstands, doubts = spec_status == "satisfied", np.zeros(len(robot.motions), np.bool_)
     if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
@@ -239,14 +239,16 @@ def _history(poses: ArrayLike) -> Floats:
 
 @leaf
 def _look_around(body: Body, pose: Floats, nexts: Floats) -> bool:
-    """Writes where each motion leads from a pose (3,) into nexts (M, 3). Whether the pose is in collision."""
+    """Writes where each motion leads from a pose (3,) into nexts (M, 3); returns whether the pose is in
+    collision.
+    """
     successors(body, pose, nexts)
     return in_collision(body, pose[0], pose[1], pose[2])
 
 
 @leaf
 def _wrapped(poses: Floats) -> bool:
-    """Takes headings into (-pi, pi]; False where a number is not finite. poses (n, 3)."""
+    """Wraps the headings of poses (n, 3) into (-pi, pi], in place. False if a number is not finite."""
     for i in range(poses.shape[0]):
         if not (math.isfinite(poses[i, 0]) and math.isfinite(poses[i, 1]) and math.isfinite(poses[i, 2])):
             return False
@@ -257,7 +259,11 @@ def _wrapped(poses: Floats) -> bool:
 def _follow(
     carry: Carry | None, poses: Floats, steps: int, body: Body
 ) -> tuple[bytes | None, tuple[float, float] | None]:
-    """The tail of the witness followed to x_t, or a new rule's way; how far x_t is from where f leads."""
+    """What is left of the witness that the robot follows, as motions from x_t, None if it follows none; how
+    far x_t is from the nearest pose that the last decision foresaw [m], [rad], None if it foresaw none.
+
+    steps: T - t. A new rule's way (`Carry.way`) comes before any witness.
+    """
     way = None if carry is None else carry.way
     if way is not None and (len(way) != steps or max(way, default=0) >= len(body.translate)):
         way = None
@@ -278,8 +284,8 @@ def _follow(
 
 @leaf
 def _gaps(foreseen: Floats, pose: Floats, gap: Floats) -> tuple[float, float]:
-    """Writes how far a pose (3,) is from each foreseen one [M, 3], metres and radians added up; [m], [rad] of
-    the nearest.
+    """Writes how far a pose (3,) is from each of the foreseen poses [M, 3] into gap (M,), metres and radians
+    added up; returns the distance to the nearest [m], [rad].
     """
     nearest, off = math.inf, (0.0, 0.0)
     for m in range(len(foreseen)):
