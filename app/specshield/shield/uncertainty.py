@@ -1,11 +1,11 @@
 """How far the robot's motions differ from f, and the margin and the slack that follow from it.
 
-A motion is taken to differ from f in two ways, whatever was before it:
+Each motion is taken to differ from f in two ways, independently of the motions before it:
 
-    noise   it ends off by a normal deviate along x and along y [m], and in heading [rad]
+    noise   it ends off by a normal deviate along x, along y [m], and in heading [rad]
     slip    it is not executed, with some probability
 
-What was said or is assumed of them before the first step is weighed against the motions that are seen
+What was said or is assumed of both before the first step is weighed against the motions that are seen
 (caution/experience.py). docs/uncertainty.md says what the margin and the slack promise, and on what terms.
 """
 
@@ -19,10 +19,11 @@ from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InputError
 
-MOST_TRANSLATION = 10.0  # [m] a motion that is less certain than this is none. Chosen by hand.
-CHANCE = 0.01  # that margin and slack do not suffice in an episode: half of it for each. Chosen by hand.
-MENDED = 0.1  # [rad] a heading off by this costs a motion to mend; a Stretch's smallest turn is 6 degrees
-HARDER = 2.0  # times the noise itself: what it costs in motions (docs/uncertainty.md)
+MOST_TRANSLATION = 10.0  # [m] the largest standard deviation that a caller may declare. Chosen by hand.
+# The accepted probability that margin or slack does not suffice in an episode; each gets half. By hand.
+CHANCE = 0.01
+MENDED = 0.1  # [rad] a heading that is off by this costs one motion; a Stretch's smallest turn is 6 degrees
+HARDER = 2.0  # noise costs this many times as many motions as its size says (docs/uncertainty.md)
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Uncertainty:
     """How far one motion may lead from where f foresees it.
 
     translation: standard deviation of the position after a motion, along each axis [m]. rotation: of the
-    heading [rad]. slip: the probability that a motion is not executed at all. The defaults are what is taken
-    of a robot of which nothing is known: the noise that the makers of SPOC define for a Stretch, and a slip
-    of 5 %.
+    heading [rad]. slip: the probability that a motion is not executed at all. The defaults are assumed of a
+    robot of which nothing is known: the noise that the makers of SPOC define for a Stretch, and a slip of
+    5 %.
 
     Raises InputError with the field's path for numbers out of range.
     """
@@ -51,10 +52,10 @@ class Uncertainty:
 
 
 class Noise(NamedTuple):
-    """What motions are taken to do from here on.
+    """How motions are taken to differ from f from now on.
 
-    move [m] and turn [rad]: standard deviations. slips: the probability that motions slip at all; if they do,
-    the share that does has the density Beta(lost, kept).
+    move [m], turn [rad]: standard deviations. slips: the probability that motions slip at all. If they do,
+    the share of them that slips has the density Beta(lost, kept).
     """
 
     move: float
@@ -70,12 +71,12 @@ EXACT = Noise(0.0, 0.0, 0.0, 1.0, 1.0)
 class Care(NamedTuple):
     """What J asks for beyond satisfaction at one step.
 
-    margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
-    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred
-    [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
-    on_way: whether the robot is where the last answer had it, on a way that keeps what was asked for then.
-    room: whether to go where a larger robot could too, where another future with room keeps the rule.
-    guess: whether the map is one of several that one decision tries.
+    margin [m]; least [steps]: the slack that every deadline gets at least. noise: may ask for more slack.
+    stride: the robot's longest move [m]. chance: the accepted probability that the slack of one deadline does
+    not suffice. barred [n, 6]: motions that futures avoid as long as one without them keeps the rule
+    (robot/barred.py); None if there are none. on_way: whether the robot is where the last answer foresaw it,
+    on a way that keeps what was asked for then. room: whether futures on which a larger robot would have room
+    are preferred. guess: whether the map is one of several that one decision tries.
     """
 
     margin: float
@@ -94,10 +95,11 @@ class Care(NamedTuple):
 
 
 def margin_for(noise: Noise, stride: float, steps: int) -> float:
-    """The margin [m] that none of `steps` motions oversteps, but for CHANCE / 2.
+    """The margin [m] that is exceeded by none of `steps` motions, with a probability of 1 - CHANCE / 2.
 
-    A deviation has two normal coordinates, and a heading that is off moves the end of the next stride too. It
-    is longer than r with the probability exp(-r^2 / 2 sigma^2); the chances of the steps are added up.
+    A deviation has two normal coordinates; a wrong heading moves the end of the next stride too. The
+    deviation is longer than r with probability exp(-r^2 / 2 sigma^2). These probabilities are added up over
+    the steps.
     """
     sigma = math.hypot(noise.move, stride * noise.turn)
     return sigma * math.sqrt(2.0 * math.log(2.0 * max(steps, 1) / CHANCE))
@@ -105,8 +107,8 @@ def margin_for(noise: Noise, stride: float, steps: int) -> float:
 
 @leaf
 def slack_for(noise: Noise, stride: float, left: int, chance: float, least: int) -> int:
-    """The fewest steps to keep free of `left` ones, `least` or more, so that these cost more of them but for
-    `chance`.
+    """The least slack, `least` or more, for a deadline in `left` steps: the motions that remain cost more
+    extra steps than that with a probability of at most `chance`.
     """
     for free in range(least, left):
         if costs_above(noise, stride, left, free) <= chance:
@@ -122,10 +124,10 @@ def spread_of(noise: Noise, stride: float) -> float:
 
 @leaf
 def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
-    """The probability that n motions cost more than `free` steps beside their own.
+    """The probability that n motions cost more than `free` steps beside their own n.
 
-    A beta-binomial number of them is not executed; what noise costs is taken to be normal, of a standard
-    deviation that grows with the root of n.
+    The number of motions that are not executed is beta-binomial. The steps that noise costs are taken to be
+    normal, with a standard deviation that grows with the square root of n.
     """
     sigma = spread_of(noise, stride) * math.sqrt(n)
     if sigma <= 0.0 and free >= n:

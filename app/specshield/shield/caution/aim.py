@@ -1,9 +1,9 @@
 """What J asks for beyond satisfaction, so that noise does not break the rule: a margin [m] and slack [steps].
 
-The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
-too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
-to the most steps with which the margin can be had, or with which as much of it can be had as without slack;
-and then raised again as far as can be, one deadline after the other.
+The margin is asked of the whole trajectory first. If no future has it there, or if slack is asked for too, it
+is asked only of those parts of the formula that are still open. If no future has both, the slack is lowered
+first: to the most steps that leave the margin, or leave as much of the margin as can be had without slack.
+Then it is raised again as far as possible, one deadline after the other.
 """
 
 from __future__ import annotations
@@ -25,11 +25,12 @@ NEVER = 1 << 40  # in place of a number of steps
 
 
 class Aimed(NamedTuple):
-    """best: the best future of each motion. kept [M]: those that keep as much as can be had of what is asked.
+    """As much of the margin and the slack as some future has.
 
-    margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
-    than the session's settings ask for; what is asked for beside them is had where it can be. early (K,)
-    [steps]: of each conjunct. visits (K,): the robustness above which its visits that are behind count.
+    best: the best future of each motion. kept [M]: the motions whose best future has that much. margin [m];
+    slack [steps]: that of the next deadline. lowered: whether either is less than the session's settings ask
+    for; more than these may be asked for because of noise. early (K,) [steps]: the slack of each conjunct.
+    visits (K,): the robustness above which visits in the past count for a conjunct.
     """
 
     best: Best
@@ -51,12 +52,12 @@ def aim(
     follows: bool,
     before: Aimed | None = None,
 ) -> Aimed:
-    """The most that can be had of the margin and the slack.
+    """The most of the margin and the slack that some future has.
 
-    whole [N], leaves [N, size]: rho of the futures on the whole of `prefix.formula`, and its leaves. A future
-    that does not satisfy it counts for nothing, whatever it keeps of a part. follows: whether the first
-    future is what is left of the way that the robot is on. before: what could be had of fewer futures, of
-    which no more is asked.
+    whole [N], leaves [N, size]: rho of `prefix.formula` along each future, and its leaves. A future that does
+    not satisfy the whole formula does not count, whatever parts it keeps. follows: whether the first future
+    is what is left of the way that the robot is on. before: the result for fewer futures; the margin and the
+    slack found then are asked of all futures now, and no more.
     """
     view, parts = conjunction_of(shield.task, prefix.formula)
     if view is not None:
@@ -76,8 +77,9 @@ def aim(
     aimed = _aim(shield, care, prefix, now, any_visit, np.zeros_like(asked))
     if True not in short.tolist():
         return aimed
-    # What was visited by less is visited again: all of it, or else each place for which that can be had with
-    # as much margin, and with half of the slack that is asked for of all that is open beside it.
+    # Places that were visited with less than the margin are visited again if that leaves as much margin, and
+    # half of the slack that is asked for, to all that is open beside them: all of these places or, if that is
+    # not possible, each of them for which it is.
     places, half, robust = short.copy(), asked // 2, any_visit + care.margin
     for some in (places, *np.eye(size, dtype=np.bool_)[places]):
         tighter = _aim(shield, care, prefix, now, np.where(some, robust, aimed.visits), half)
@@ -89,7 +91,7 @@ def aim(
 
 
 def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, sooner: Ints) -> Aimed:
-    """`aim`, where a visit that is behind counts if it was more robust than its conjunct's `visits` (K,), and
+    """`aim`, where a past visit counts if its robustness was above its conjunct's entry of `visits` (K,), and
     the slack is not lowered below `sooner` (K,).
     """
     margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
@@ -97,7 +99,7 @@ def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, 
     early = now.asked.copy()
     if not had:
         best, had = _best_open(now, early := sooner, margin)
-        if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
+        if not had:  # there is no such margin either: ask for the largest that there is, and then for slack
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
         for of in (early >= 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
             low, high = int(early[of].min()), int(now.asked[of].max()) + 1
@@ -114,10 +116,11 @@ def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, 
 
 
 class Open(NamedTuple):
-    """The conjuncts at step t: which are still open (K,), above which robustness they are `settled` (K,), how
-    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not. short (K,):
-    which have a visit behind that can yet be made again with the margin that it lacks. motion_count: of the
-    robot's motions. The rest is as in `aim`.
+    """The K conjuncts at step t, and what `aim` was given of the futures.
+
+    still: which are open. settled: above which robustness each counts as settled. asked: the slack that is
+    asked for [steps]. due: in how many steps each is due, NEVER for one that is not. short: which have a past
+    visit that lacks the margin and can be made again with it. motion_count: how many motions the robot has.
     """
 
     parts: Conjuncts
@@ -138,8 +141,8 @@ class Open(NamedTuple):
 def _best_asked(
     now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: Floats, margin: float
 ) -> tuple[Best, bool]:
-    """Fills in `still`, `settled`, `asked`, `due` and `short` of `now`, and then answers as `_best_open` does
-    for what is asked. care: its noise, stride, least and chance. A window keeps half its length.
+    """Fills in `still`, `settled`, `asked`, `due` and `short` of `now`, then returns `_best_open` for what is
+    asked. care: noise, stride, least and chance of the `Care`. A window keeps at least half its length.
     """
     (parts, still, settled, asked, due, t, short), (noise, stride, least, chance) = now[:7], care
     find_open(parts, known, t, np.full(settled.shape[0], margin), still, settled)
@@ -150,11 +153,11 @@ def _best_asked(
         half, due[k], asked[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER, 0
         if still[k] and half > 0:
             left = parts.b[k] + parts.horizon[k] - t
-            if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
+            if parts.kind[k] != EVENTUALLY:  # the first step at which its child is asked for
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             due[k] = left
-            # What an earlier step asks for, and is still open, is due first.
+            # If the child is still open at an earlier step of the window, that is due first.
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
                 if not low[parts.at[k] - parts.a[k] + i] > settled[k]:
                     due[k] = min(due[k], i + parts.horizon[k] - t)
@@ -163,10 +166,11 @@ def _best_asked(
 
 @kernel
 def _best_open(now: Open, early: Ints, margin: float) -> tuple[Best, bool]:
-    """The best future of each motion by what is open, and whether some motion's keeps the margin.
+    """The best future of each motion, by rho of the open conjuncts with slack `early` (K,), and whether one
+    of these is above `margin`.
 
-    The way that the robot is on stays its motion's future (`row`) where it keeps enough, though another may
-    be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
+    The way that the robot is on stays the best future of its motion if it is above the margin, even if
+    another future is more robust: a robot that changes to a better way at each step may never arrive.
     """
     rho = np.empty(now.whole.shape[0])
     rate_open(now.parts, now.still, now.t, now.settled, early, now.leaves, rho)

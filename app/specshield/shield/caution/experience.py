@@ -1,8 +1,8 @@
 """What a session has seen of its robot: every motion is compared with f, and weighed against what is known.
 
-A pose that is on the way of a motion and short of its end, or where the robot stood, is a motion that was not
-executed, or not all of it; any other gap between a pose and f is noise. The shield knows poses and its own
-draws, not what was executed: a robot that stands may have been told to, and counts by how likely that is.
+If the robot stands where it stood, or short of where a motion leads, that motion was not executed, or not all
+of it. Any other gap between a pose and f is noise. The shield knows poses and its own draws, not what was
+executed. So a robot that stands may have been told to, and counts by how likely that is.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from specshield.task import Task, kept_with_task
 ASSUMED = Uncertainty()
 Told = tuple[float, float, float, bool]  # what `Uncertainty` says, and whether it is only assumed
 
-# How much what is taken before the first step weighs. Chosen by hand.
-KNOWN_WEIGHT = 1000.0  # [motions] what was said of the robot
-NOISE_WEIGHT, SLIP_WEIGHT = 20.0, 60.0  # [motions] what is assumed of it
-SLIPS_AT_ALL = 0.5  # the assumed probability that motions slip, before the first
-EXACT = 1e-6  # [m] and [rad]: what ends this near to where f has it shows no noise
-SURE = 3  # [motions] that have shown none, after which there is none but for what is seen
-STRAY = 0.25  # of a motion's length: what misses by more, and by more than noise, was stopped
-MOST_ODDS = 1e6  # so that what changes late is still noticed
+# For how many motions that were seen each prior counts. Chosen by hand.
+KNOWN_WEIGHT = 1000.0  # [motions] what the caller said of the robot
+NOISE_WEIGHT, SLIP_WEIGHT = 20.0, 60.0  # [motions] what is assumed of a robot that nothing was said of
+SLIPS_AT_ALL = 0.5  # the assumed probability that motions slip at all
+EXACT = 1e-6  # [m], [rad] a motion that ends this near to where f leads shows no noise
+SURE = 3  # [motions] after so many without noise, the assumed noise is dropped
+STRAY = 0.25  # of a motion's length: one that misses its end by more, and by more than noise, was stopped
+MOST_ODDS = 1e6  # a bound on `Seen.odds`, so that slips that begin late are still noticed
 TINY = 1e-9  # [motions]
-BESIDE = 0.2  # [m] from the footprint, which may be told wrong: what is so near may be met. By hand.
-FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
-SELDOM = 1e-3  # what slips alone do not do so often is done by something else; chosen by hand
+BESIDE = 0.2  # [m] the robot may meet obstacles this near: its footprint may be told wrong. By hand.
+FAR = 5.0  # [sigma] the most that noise does: one motion in 270,000 ends farther off
+SELDOM = 1e-3  # what slips alone would do less often than this has another cause. Chosen by hand.
 
 FORMAT = struct.Struct("<9d")
 
@@ -45,11 +45,11 @@ FORMAT = struct.Struct("<9d")
 class Seen(NamedTuple):
     """What a session remembers of its motions.
 
-    moved: how many there were, and lost: how many of them were not executed; both may be fractions. odds: of
-    what was seen if motions never slip, to if they do. noisy: how many were measured against f; moves, turns:
-    the sums of their squared residuals [m^2], [rad^2]; exact: how many had none, of those that do not turn on
-    the spot, which says nothing of a stride. standing: the probability, by the last answer, that the robot is
-    not told to move. slipping: how likely it was to stand, by slips alone, as often in a row as it has now.
+    moved: how many there were; lost: how many of them were not executed. Both may be fractions. odds: how
+    many times as likely what was seen is if motions never slip as if they do. noisy: how many were compared
+    with f; moves, turns: the sums of their squared residuals [m^2], [rad^2]. exact: how many moves (not turns
+    on the spot) had no residual. standing: the probability, by the last answer, that the robot was not told
+    to move. slipping: the probability that slips alone make the robot stand as often in a row as it has now.
     """
 
     moved: float = 0.0
@@ -68,7 +68,8 @@ def learn(
 ) -> tuple[Seen | None, Care]:
     """What has been seen up to x_t, and what J asks for because of it. poses [t + 1, 3].
 
-    contact: the last motion ran into something, or on through it, and says nothing of how the robot moves.
+    contact: whether the last motion met something, or led on where f has it stopped. Such a motion does not
+    count.
     """
     config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
     if known is None:
@@ -90,7 +91,7 @@ def _told(known: Uncertainty) -> Told:
 
 
 def within_noise(shield: Shield, carry: Carry) -> tuple[float, float] | None:
-    """How far [m], [rad] noise leads at most from where f does; None where nothing is learned of it."""
+    """How far noise leads from where f does, at most [m], [rad]; None if the session does not learn that."""
     known = shield.config.uncertainty
     if known is None or carry.residuals is None:
         return None
@@ -99,9 +100,9 @@ def within_noise(shield: Shield, carry: Carry) -> tuple[float, float] | None:
 
 
 def was_stopped(shield: Shield, carry: Carry, poses: Floats, halts: int = 0) -> bool:
-    """Whether a motion that ended short at x_t met something: noise and slips do not explain it.
+    """Whether a motion that ended short at x_t met something, since noise and slips do not explain it.
 
-    halts: how often it did nothing at this pose before.
+    halts: how often the same motion did nothing at this pose before.
     """
     known = shield.config.uncertainty
     if known is None or carry.residuals is None:
@@ -117,8 +118,8 @@ def was_stopped(shield: Shield, carry: Carry, poses: Floats, halts: int = 0) -> 
 
 @kept_with_task
 def _measures(task: Task) -> tuple[float, int]:
-    """The longest move [m], and how many deadlines the formula has, both at least 1 where there is none. What
-    is no F has one in each longest window, as a patrol does.
+    """The longest move [m], 1 if there is none; and how many deadlines the formula has, at least 1. A
+    conjunct that is no F, such as a patrol, has one deadline for each longest window in it.
     """
     longest = max((abs(move) for move, _ in task.robot.motions), default=0.0)
     parts = conjunction_of(task, task.formula)[1]
@@ -130,8 +131,8 @@ def _measures(task: Task) -> tuple[float, int]:
 def remember(
     shield: Shield, seen: Seen, distribution: Floats, moved: int, nexts: Floats, pose: Floats
 ) -> bytes:
-    """What is handed on. distribution [A]: of what the robot does, as far as that is known; moved: what is
-    executed for a terminal action; nexts [M, 3]: where f leads from the pose (3,).
+    """`seen` as bytes for the next decision. distribution [A]: what the robot will do, as far as that is
+    known; moved: the action that it executes for a terminal one; nexts [M, 3]: where f leads from the pose.
     """
     motion_of = shield.task.robot.motion_of
     return FORMAT.pack(*seen._replace(standing=chance_of(motion_of, distribution, moved, nexts, pose)))
@@ -139,7 +140,7 @@ def remember(
 
 @kernel
 def chance_of(motion_of: Ints, distribution: Floats, moved: int, nexts: Floats, pose: Floats) -> float:
-    """The probability that what is done leads to a pose (3,); motion_of [A], the rest is as in `remember`."""
+    """The probability that the robot is led to a pose (3,). motion_of [A]; for the rest see `remember`."""
     total = 0.0
     for a in range(motion_of.shape[0]):
         m = motion_of[a] if motion_of[a] >= 0 else motion_of[moved]
@@ -150,9 +151,7 @@ def chance_of(motion_of: Ints, distribution: Floats, moved: int, nexts: Floats, 
 
 @leaf
 def noise_of(told: Told, seen: Seen) -> Noise:
-    """The means of what was told, as in `Uncertainty`, and of what was seen, each by how many motions it
-    stands for.
-    """
+    """The noise by what was told and by what was seen, each weighted by the motions that it counts for."""
     translation, rotation, slip, assumed = told
     weight, weight_of_slip, at_all = KNOWN_WEIGHT, KNOWN_WEIGHT, 1.0
     if assumed:
@@ -172,8 +171,8 @@ def noise_of(told: Told, seen: Seen) -> Noise:
 
 @kernel
 def went_on(body: Body, before: Floats, foreseen: Floats, pose: Floats, near: tuple[float, float]) -> int:
-    """The motion that led farther than f, which has it run into something, so that the map or the footprint
-    is not as told; -1 where none did. near [m], [rad]: what noise explains; the others are as in `observe`.
+    """The motion that led on to `pose` though f has it stopped by an obstacle, so that the map or the
+    footprint is told wrong; -1 for none. near: what noise explains [m], [rad]. For the rest see `observe`.
     """
     led, closest, (x, y, theta) = -1, np.inf, before
     for m in range(foreseen.shape[0]):
@@ -188,8 +187,8 @@ def went_on(body: Body, before: Floats, foreseen: Floats, pose: Floats, near: tu
 
 @kernel
 def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floats) -> Seen:
-    """Takes one step into what is remembered. before, pose (3,): x_{t-1} and x_t; foreseen [M, 3]: where f
-    leads from x_{t-1}.
+    """`seen` after one more step. before, pose (3,): x_{t-1}, x_t; foreseen [M, 3]: where f leads from
+    x_{t-1}.
     """
     miss, way, motion = np.inf, 0.0, -1
     for m in range(foreseen.shape[0]):
@@ -201,7 +200,7 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
     noise, still = noise_of(told, seen), _gap(before, pose)
     far = FAR * (noise.move + noise.turn)
     if still < miss or miss > max(STRAY * way, far):
-        # It was to move and did not, or it was to stand: how likely is either?
+        # Either it was told to move and did not, or it was told to stand. How likely is each?
         rate = noise.lost / (noise.lost + noise.kept)
         standing = seen.standing if still <= EXACT + far else 0.0
         asked = (1.0 - standing) * rate
@@ -229,11 +228,13 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
 def _weighed(
     body: Body, beside: bool, told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floats
 ) -> tuple[Seen, Noise]:
-    """`observe`, and the noise by it. beside: whether the robot may have met what it stands beside."""
+    """`observe`, and the noise that follows. beside: whether slips beside an obstacle do not count, since
+    the robot may have met it.
+    """
     found, near = observe(told, seen, before, foreseen, pose), body.radius + BESIDE
     u, v = centre(body, before[0], before[1], before[2])
     if beside and found.moved > seen.moved and near - free_distance(body, u, v, near) > TOUCH:
-        # There, neither what failed nor what worked counts.
+        # Neither motions that were executed there nor those that were not tell how often motions slip.
         found = Seen(seen.moved, seen.lost, seen.odds, *found[3:])
     return found, noise_of(told, found)
 

@@ -4,11 +4,12 @@ V(a) is a lower bound on the probability of keeping the rule after a, V* the lar
 
     pi_t = the distribution nearest to the model's with E_pi[V] >= d_t,    d_{t+1} = d_t V*_{t+1} / E_pi_t[V].
 
-Where V is never more than what its best successor is expected to have, d_t is expected never to fall, and
-d_t <= V*_t; so the rule is kept with probability delta or more. In an exact world V is J, 0 or 1.
+If V(a) is never above the expected V* of the next step, then E[d_{t+1}] >= d_t, and d_t <= V*_t; so the rule
+is kept with probability delta or more. In an exact world V is J, 0 or 1.
 
-Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost
-(docs/uncertainty.md): a lower bound with slips alone, and an estimate with noise.
+If motions differ from f, V(a) is the probability that the best future after a is in time, and within its
+margin, in spite of what slips and noise cost (docs/uncertainty.md): a lower bound with slips alone, an
+estimate with noise.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from specshield.shield.uncertainty import Care, Noise, above, spread_of
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY, tree_value
 
-GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
+GRID = 100  # V is rounded down to a multiple of 1 / GRID, so that actions which are nearly as good are equal
 
 # Longer delays, chosen by hand beside what `python -m benchmarks.lateness` prints: how often a motion has
 # one, for each step of `spread_of` [1 / step], and how long it lasts in the mean [steps].
 HELD_UP, FOR = 0.04, 5.0
-MOST_SLIPS, UNLIKELY = 64, 1e-9  # slips of one future that are looked at, and their probability; by hand
+MOST_SLIPS, UNLIKELY = 64, 1e-9  # more slips of one future, or less probable ones, are not counted. By hand.
 
 
 def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
-    """V of each action [A]; of a terminal one, 0. doubts [M]: motions that are not to be drawn though some
-    future by them may keep the rule, where others are feasible.
+    """V of each action [A]; 0 for a terminal one. doubts [M]: motions that get V = 0 if they are not
+    feasible while others are, though some future of theirs may keep the rule.
     """
     tried, task = judged.tried, shield.task
     view, parts = conjunction_of(task, prefix.formula)
@@ -46,7 +47,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
-    rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
+    rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # futures set aside do not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
     find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
@@ -72,7 +73,9 @@ def _chances(
     wait: int,
     values: Floats,
 ) -> None:
-    """Writes V of each motion (M,), which is zero where no future keeps the rule."""
+    """Raises V of each motion, values (M,), which is 0 at first, to that of its best future. still (K,): the
+    conjuncts that are open; leaves (N, size), rho (N,), motions (N, T - t): of the futures.
+    """
     count, spread = still.shape[0], spread_of(noise, stride)
     sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
@@ -105,9 +108,11 @@ def _chances(
 
 @leaf
 def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -> tuple[int, int, int]:
-    """What conjunct k asks of a future: after how many of its motions the robot is where it has to be, or 0
-    where nothing is asked; how many steps later that may be; and how many steps from t it has for it. An F is
-    first kept by `margin`, or else by as little as it is. A G that has begun has no deadline.
+    """The deadline of conjunct k along a future: after how many motions the robot is where it has to be, 0
+    for no deadline; how many steps later it may be there; and in how many steps from t the deadline is.
+
+    An F counts from the first step that meets it by `margin`, or meets it at all if none does. A G that has
+    begun has no deadline. buffer (size,): the values of the leaves along the future.
     """
     a, b, first, met = parts.a[k], parts.b[k], parts.at[k] - parts.a[k], -1
     if parts.kind[k] == EVENTUALLY:
@@ -131,12 +136,13 @@ def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -
 def _in_time(
     noise: Noise, spread: float, slips: bool, due: Ints, motions: Ints, wait: int, dwells: int, late: Floats
 ) -> float:
-    """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
-    It repeats what was not executed, and leaves out waits where it is late, but for the first `dwells`.
+    """The probability that a robot which follows a future's motions (T - t,) meets all deadlines. It repeats
+    a motion that was not executed and, if it is late, leaves out waits, but not among the first `dwells`.
 
-    due (K, 3): of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
-    motions slipped, and the robot is so many steps late and was in time for all that was due before. More
-    slips, and what is less likely than UNLIKELY, are too late. What noise costs is rounded to whole steps.
+    slips: whether motions slip. due (K, 3): results of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2):
+    scratch; late[s, k] is the probability that s motions slipped and the robot is k steps late, but was in
+    time for all that was due before. More slips than MOST_SLIPS, and those less likely than UNLIKELY, count
+    as too late. What noise costs is rounded to whole steps.
     """
     last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
@@ -181,7 +187,7 @@ def _in_time(
 
 
 def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
-    """d_t / V*_t. values [A]: V; None where nothing was asked of this step."""
+    """d_t / V*_t. values [A]: V, None if the step was not shaped."""
     if carry is not None and carry.threshold_left is not None:
         return carry.threshold_left
     best = 1.0 if values is None else float(values.max())
@@ -189,7 +195,9 @@ def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float
 
 
 def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools) -> float:
-    """d_{t+1} / V*_{t+1}. values, distribution [A]; after a terminal action the best one is executed."""
+    """d_{t+1} / V*_{t+1} = d_t / E_pi_t[V]. left: d_t / V*_t. values, distribution [A]: V and pi_t; in place
+    of a terminal action the best motion is executed.
+    """
     best = float(values.max())
     expected = float(inner(distribution, np.where(terminal, best, values)))
     if best <= 0.0 or expected <= 0.0:
