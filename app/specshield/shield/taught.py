@@ -1,7 +1,7 @@
-"""The shield as a session's own map has it: what the world taught, decision by decision.
+"""The shield on a session's own map: what the session learns of it, decision by decision.
 
-Certification uses the map that is known in the very decision that learns it. Policies are asked for ways on
-it too: one that has `on_body` proposes on the session's map, whatever its tables were made for.
+A decision certifies on the map as it is known after what it has just learned itself. Policies that have
+`on_body` propose on that map too, whatever map their tables were made for.
 """
 
 from __future__ import annotations
@@ -53,25 +53,26 @@ from specshield.world.learned import (
     revised,
 )
 
-# [steps] what a way around something takes that only contacts show, by hand (docs/decisions.md). A robot that
-# turns round for it gets up to as many more: of 30 runs a locobot kept 28 so, and 22 without them.
+# [steps] what a way around an obstacle takes that only contacts show, by hand (docs/decisions.md). A robot
+# that has to turn round gets up to as many more: of 30 runs a locobot kept 28 with them, and 22 without.
 AROUND = 20
-NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was run into
-SAME_PLACE = 1e-6  # [m]; what rounding explains
-KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
-HEAD = struct.Struct("<h?hB3f")  # what `Followed` holds
+NEARBY = 2.0  # [m] poses farther away than this say nothing of an obstacle that was run into
+SAME_PLACE = 1e-6  # [m] poses this near differ by rounding alone
+KEPT = 64  # bodies on learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
+HEAD = struct.Struct("<h?hB3f")  # the fields of `Followed`
 MOST_MET = 255  # contacts at one pose that HEAD can hold
 NEVER_DRAWN = Followed()
 
 
 class Taught(NamedTuple):
-    """What a session has learned: its map, and how its caller follows what is drawn.
+    """What a session has learned: its map, and whether its caller executes what is drawn.
 
-    contact: whether the last motion ran into something, or on through it. looks: whether a sensor says what
-    it sees at this step, be it nothing. Neither is handed on. stuck: where the robot stood and which motion
-    led nowhere from there, or elsewhere than f has it, whatever is marked. here: the first step at which this
-    robot was on this map. Both are handed on beside the bytes. near: how far apart two poses are that may be
-    one.
+    contact: whether the last motion ran into something, or went on where f has it stopped. looks: whether
+    `occupied` was sent at this step, be it empty. near [m], [rad]: poses this near may be one, but for noise.
+    These three are not handed on.
+
+    stuck: motions that led nowhere, or elsewhere than f has it, and from where. here: the first step at which
+    this robot was on this map. `Carry` holds these two beside the bytes.
     """
 
     map: LearnedMap = NONE
@@ -84,7 +85,7 @@ class Taught(NamedTuple):
 
     @property
     def barred(self) -> Floats:
-        """[n, 6]: what no future goes by where another keeps the rule."""
+        """[n, 6]: the motions that futures avoid as long as one without them keeps the rule."""
         return barred_by(self.stuck, self.near) if self.stuck else NOTHING_BARRED
 
     def to_bytes(self) -> bytes:
@@ -102,10 +103,10 @@ class Taught(NamedTuple):
 def teach(
     shield: Shield, carry: Carry | None, poses: Floats, occupied: ArrayLike | None, free: ArrayLike | None
 ) -> tuple[Taught, tuple[str, ...]]:
-    """What the session knows at step t = len(poses) - 1, and warnings about the points [n, 2] that were sent.
+    """What the session knows at step t = len(poses) - 1, and warnings about the points that were sent.
 
-    carry: what the last decision handed on: what was known then, and where each motion would lead. Raises
-    SampleError for points that are none.
+    carry: what the last decision handed on. occupied, free [n, 2]: points that sensors see [m]. Raises
+    SampleError for points that are not such a list.
     """
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
     learned, stuck, here = (None, (), 0) if carry is None else (carry.learned, carry.stuck, carry.here)
@@ -132,7 +133,7 @@ def teach(
             stuck = led_nowhere(stuck, poses[-1], max(motion, followed.halted), near)
         elif followed.halted >= 0 and followed is not before.followed:
             stuck = did_nothing(stuck, poses[-1], followed.halted, near)
-        elif on >= 0:  # it led elsewhere than f has it: to rely on f there again may lead round in a circle
+        elif on >= 0:  # f was wrong there: a way that relies on it again may lead round in a circle
             stuck = led_nowhere(stuck, poses[-2], on, near)
         elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):
             stuck = worked(stuck, poses[-2], drawn, near)
@@ -144,14 +145,14 @@ def teach(
         if motion >= 0:
             driven = poses[here:][np.hypot(*(poses[here:, :2] - poses[-1, :2]).T) <= NEARBY]
             met = cells_met(body, poses[-1], motion, driven)
-            if not any(len(cells) for _, cells in met):  # the footprint is told wrong, or someone came
+            if not any(len(cells) for _, cells in met):  # a wrong footprint, or something that moved there
                 met = cells_met(body, poses[-1], motion, poses[-1:])
             for by, cells in met:
-                # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
+                # Cells along the front were touched, so they replace guesses. A guess replaces nothing.
                 kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
                 known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
     beyond, said = 0, list[str]()
-    for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
+    for name, points in (("free", free), ("occupied", occupied)):  # a cell sent as both is occupied
         if points is not None:
             cells, outside = cells_of(grid, check_points(points, name))
             if name == "occupied":
@@ -168,8 +169,8 @@ def teach(
 
 @leaf
 def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tuple[bool, bool]:
-    """Whether the footprint covers obstacles by more than UNDER half way between two poses (3,), and at the
-    second. half_way (3,) is written: a motion goes straight on before it turns.
+    """Whether the footprint overlaps obstacles by more than UNDER half way between two poses (3,), and at the
+    second. Writes the pose half way, before the motion's turn, into half_way (3,).
     """
     half_way[0], half_way[1] = 0.5 * (before[0] + after[0]), 0.5 * (before[1] + after[1])
     half_way[2] = before[2]
@@ -179,20 +180,20 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
 
 @kernel
 def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -> bool:
-    """Whether the robot is where f leads, but for rounding, and covers no obstacle. Poses (3,)."""
+    """Whether the robot is where f leads, but for rounding, and overlaps no obstacle. Poses (3,)."""
     half, whole = _covers(body, before, after, np.empty(3))
     return is_near(foreseen.reshape(1, 3), after, (SAME_PLACE, SAME_PLACE)) and not (half or whole)
 
 
 def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
-    """What J asks for where the map may be wrong: time for a way around, room beside it, and not by what led
-    nowhere. on_way: as `Care` has it.
+    """`care`, and what J asks for because the map may be wrong: time for a way around, room beside it, and
+    none of the motions that led nowhere. on_way: see `Care`.
     """
     config, room, unsure = shield.config, False, shield.config.uncertainty is not None
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and unsure:
         room = not shield.task.robot.goes_back
-        turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # it turns round, twice
+        turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # for half a turn, twice
         least = max(least, AROUND + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if turn else 0))
     return care._replace(least=least, barred=barred, on_way=on_way and unsure, room=room)
 
@@ -200,13 +201,13 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
 def doubtful(
     told: Shield, taught: Taught, prefix: Prefix, nexts: Floats, left_out: Bools
 ) -> tuple[Bools, Bools]:
-    """The motions [M] from x_t that lead elsewhere if contacts are believed than if they are not, those that
-    would break what the prefix asks for if nothing stopped them short, those that led nowhere before, and
-    those left out [M] already; and of all these the ones that would break it [M].
+    """The motions [M] that had better not be drawn, and which of them may break the prefix's formula [M].
 
-    told: the shield on the policy's map. nexts [M, 3]: where f leads on the session's own. A motion that only
-    a mark stops may go on in truth; and what is on the map may stand a little elsewhere, so no motion is kept
-    out of a forbidden place by that alone.
+    The first are: those that end elsewhere if contacts are not believed, since what only a contact marks may
+    not be there; those that an obstacle stops short and that would break the formula if it stood a little
+    farther away; those that led nowhere before; and `left_out` [M]. The second are the second of these kinds.
+
+    told: the shield on the policy's map. nexts [M, 3]: where f leads from x_t on the session's own map.
     """
     known, motions, pose = taught.map, len(nexts), prefix.poses[-1]
     doubts, risky, config = left_out.copy(), np.zeros(motions, np.bool_), told.config
@@ -229,8 +230,8 @@ def doubtful(
 
 @leaf
 def _stop_short(far: Floats, turn: Floats, pose: Floats, nexts: Floats, stopped: Bools) -> None:
-    """Marks the motions [M] that end at `nexts` [M, 3], short of their displacements [M] from a pose (3,), in
-    `stopped`.
+    """Writes into stopped (M,) which motions end short of their displacement from a pose (3,). far [m], turn
+    [rad] (M,): the displacements; nexts (M, 3): where f leads.
     """
     for m in range(nexts.shape[0]):
         gone = math.hypot(nexts[m, 0] - pose[0], nexts[m, 1] - pose[1])
@@ -239,8 +240,8 @@ def _stop_short(far: Floats, turn: Floats, pose: Floats, nexts: Floats, stopped:
 
 
 def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:
-    """Where a motion from a pose (3,) may lead if what f has stop it at `end` (3,) stands farther on: every
-    cell's side, and where nothing stops it.
+    """Where a motion from a pose (3,) may lead if the obstacle that stops it at `end` (3,) stands farther
+    away: a pose at least every cell's side, and the pose that it leads to if nothing stops it.
     """
     (far, turn), (x, y, theta) = displacement(body, motion), pose
     goes_on = far - math.copysign(math.hypot(end[0] - x, end[1] - y), far)
@@ -252,7 +253,7 @@ def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Flo
 def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Floats | None = None) -> Shield:
     """The shield on a session's own map. guess: whether it is one of several that a decision tries.
 
-    barred [n, 6]: what its policies are to find ways without (robot/barred.py).
+    barred [n, 6]: motions without which its policies are to find ways (robot/barred.py).
     """
     body, proposers = body_on(shield, known), shield.proposers
     if len(known):
@@ -265,8 +266,8 @@ def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Float
 def handed_on(
     shield: Shield, taught: Taught, drawn: int, moved: int, distribution: Floats, nexts: Floats, pose: Floats
 ) -> bytes | None:
-    """What the next decision has to know; None where nothing was learned, and nothing is to be. drawn: the
-    motion that was drawn, -1 for none; the rest is as in `remember`.
+    """`taught` as bytes for the next decision; None if nothing was learned and the session learns nothing by
+    itself. drawn: the motion that was drawn, -1 for a terminal action; for the rest see `remember`.
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
