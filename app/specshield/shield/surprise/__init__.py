@@ -1,1 +1,1 @@
-"""What a world that is not as told says of the map, and what is kept where the rule is lost."""
+"""What steps that go otherwise than foreseen say of the map, and what is done if no future keeps the rule."""

@@ -22,21 +22,24 @@ from specshield.shield.caution.experience import SELDOM
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
 Near = tuple[float, float]  # [m], [rad] poses this near may be one, but for noise
-# Of a robot of which nothing is known: five times the noise of a Stretch's controller (0.01 m, 0.5 degrees,
-# as SPOC's stochastic controller has it). Chosen by hand.
+# For a robot of which nothing is known: five times the noise that SPOC's stochastic controller gives a
+# Stretch (0.01 m, 0.5 degrees). Chosen by hand.
 NEAR: Near = (0.05, math.radians(2.5))
 
 ARC = math.radians(25.0)  # [rad] to both sides of straight ahead: where a contact is most likely. By hand.
 ASIDE = math.radians(75.0)  # [rad] to both sides: where it may be. Chosen by hand.
-THING = 0.3  # [m] how wide and deep a thing is taken to be that is on no map; chosen by hand
-UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the noise
+THING = 0.3  # [m] how wide and deep an obstacle is taken to be that is on no map; chosen by hand
+UNDER = 0.03  # [m] a cell that the footprint overlaps by more than this is free: three times the noise
 
 
 class Followed(NamedTuple):
-    """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
-    be what was drawn, and the drawn motion that did nothing in the step before (-1: none). met: how many
-    contacts there were at this very pose. by_chance: the probability that a caller who draws by itself seems
-    to follow so far. going, standing: that it goes where the drawn motion leads next, and that it stays.
+    """What is known of whether the caller executes what is drawn.
+
+    drawn: the motion that was drawn last, -1 for none. follows: whether all steps so far fit what was drawn.
+    halted: the drawn motion that did nothing in the step before, -1 for none. met: how many contacts there
+    were at this very pose. by_chance: the probability that a caller who draws for itself seems to follow for
+    so long. going, standing: the probabilities that it next goes where the drawn motion leads, and that it
+    stays.
     """
 
     drawn: int = -1
@@ -62,7 +65,7 @@ def contact_of(
     near: Near = NEAR,
     again: bool = False,
 ) -> tuple[int, Followed]:
-    """The motion that stopped short between two poses (3,), -1 for none, and what is known of the caller now.
+    """The motion that stopped short between two poses (3,), -1 for none; and `followed` after this step.
 
     foreseen [M, 3]: where f leads from `before`. near: what noise explains. again: whether the drawn motion
     did nothing at this pose before.
@@ -74,10 +77,10 @@ def contact_of(
         followed = followed._replace(by_chance=followed.by_chance * followed.standing)
         if drawn < 0 or not followed.surely:
             return -1, followed._replace(halted=-1)
-        if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
+        if followed.halted == drawn or followed.met or again:  # something stopped it here already
             return drawn, followed._replace(halted=-1, met=followed.met + 1)
         return -1, followed._replace(halted=drawn)
-    if is_near(foreseen, after, near):  # who surely follows may have met something before an arc's turn
+    if is_near(foreseen, after, near):  # an arc that met something before its turn ends where a move does
         began = drawn >= 0 and is_near(np.append(foreseen[drawn, :2], before[2])[None], after, near)
         return -1, followed._replace(follows=followed.surely and began, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
@@ -88,7 +91,7 @@ def contact_of(
 
 
 def moved_on(followed: Followed, as_drawn: bool = False) -> Followed:
-    """After a motion that met nothing. as_drawn: whether it was the one that was drawn."""
+    """`followed` after a motion that met nothing. as_drawn: whether it was the one that was drawn."""
     if as_drawn and followed.by_chance >= SELDOM and followed.going < 1.0:
         followed = followed._replace(by_chance=followed.by_chance * followed.going)
     return followed._replace(halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
@@ -122,9 +125,9 @@ def _short(body: Body, before: Floats, after: Floats, foreseen: Floats, near: Ne
 def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tuple[int, Ints]]:
     """The cells, ascending, of what a motion may have run into at a pose (3,), by where they lie.
 
-    CONTACT, LEFT and RIGHT begin within a cell's side of the footprint: straight ahead of where its centre
-    goes (a turn swings it), and to both sides of that. BEHIND them lies the rest of a thing of the usual
-    size. What the footprint covered at the poses driven [n, 3] is none of it.
+    CONTACT, LEFT and RIGHT lie within a cell's side of the footprint: straight ahead of where its centre
+    goes, which a turn swings, and to both sides of that. BEHIND is the rest of an obstacle of the usual size.
+    Cells that the footprint overlapped at the poses driven [n, 3] are left out.
     """
     cells, gap, bearing = _around(body, pose, THING)
     aside = np.remainder(bearing - _direction(body, pose, motion) + math.pi, 2.0 * math.pi) - math.pi
@@ -158,7 +161,9 @@ def cells_under(body: Body, pose: Floats, deep: float) -> Ints:
 
 
 def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floats]:
-    """The cells within `beyond` [m] of the footprint, how far each is from it, and where from its centre."""
+    """The cells within `beyond` [m] of the footprint, how far each is from it [m], and in which direction
+    from its centre [rad].
+    """
     h, (u, v) = body.resolution, centre(body, *pose)
     reach = body.radius + beyond + h
     height, width = body.occupied.shape
@@ -175,7 +180,9 @@ def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floa
 
 @kernel
 def _gaps(body: Body, cells: Ints, poses: Floats) -> Floats:
-    """How far each cell [n] is from the footprint at the nearest of the poses [m, 3]; below 0: under it."""
+    """How far each cell [n] is from the footprint at the nearest of the poses [m, 3], in metres; below 0 if
+    the footprint overlaps it.
+    """
     h, width = body.resolution, body.occupied.shape[1]
     gap = np.full(cells.shape[0], np.inf)
     for pose in poses:

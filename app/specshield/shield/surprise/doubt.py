@@ -1,4 +1,4 @@
-"""What is believed where what was seen or touched leaves no way, and what is done where none is left."""
+"""If what was seen or touched leaves no way, what of it is doubted; and what is done if no way is left."""
 
 from __future__ import annotations
 
@@ -18,17 +18,19 @@ from specshield.shield.taught import Taught, body_on, on_map
 from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
-DOUBTED_AFTER = 4  # [steps] then what was met is tried again where nothing else is left; chosen by hand
-UNSEEN_AFTER = 20  # [steps] then the same is done with what was sent as occupied, and not again; by hand
-MOST_PARTS = 4  # of those that no way keeps together: for which ways are asked that keep one; chosen by hand
+DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
+UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
+MOST_PARTS = 4  # parts of the rule, which no way keeps together, that are tried one by one; chosen by hand
 
 
 def tried_again(
     told: Shield, taught: Taught, judged: Judged, now: Situation
 ) -> tuple[Taught, tuple[Shield, Situation, Judged, bool]] | None:
-    """The first guess that leaves a way without what was tried in vain, else, where all the marks leave none,
-    the first that leaves any, and how it was judged. None where no guess is needed, or none leaves a way.
-    told: the shield on the policy's map; judged: where all the marks are believed.
+    """The first guess about the map that leaves a way without motions that led nowhere before, and how the
+    actions were judged by it. If there is none and the map as marked leaves no way at all, the first guess
+    that leaves any. None if no guess is needed, or none leaves a way.
+
+    told: the shield on the policy's map; judged: by the map as marked.
     """
     if judged.some and not judged.vain:
         return None
@@ -43,14 +45,14 @@ def tried_again(
 
 
 def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
-    """What may be believed of the map where no way is left, in the order in which it is to be tried.
+    """What may be believed of the map if no way is left, in the order in which it is to be tried.
 
     A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
     less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
     lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
-    before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
-    forgotten, since no contact shows that a thing is gone; then also what a sensor has not seen again for
-    UNSEEN_AFTER steps, since it may look elsewhere. Last, all that the robot has just passed is free.
+    before was wrong, so the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
+    forgotten, since no contact shows that an obstacle is gone; then also cells that no sensor has seen again
+    for UNSEEN_AFTER steps, since it may look elsewhere. At last, all that the robot has just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, first = known.occupied & ~sent, max(taught.followed.met - 1, 0) % len(GUESSES)
@@ -63,35 +65,36 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     if told.config.learn_map:
         recent = prefix.poses[max(t - DOUBTED_AFTER, taught.here) :]
         under = [cells_under(body, pose, 0.0) for pose in recent if overlap(body, *pose) > 0.0]
-        passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # not what came there later
+        passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # what was learned stays
         free = learn(told.task.grid, known, t, passed, False, CONTACT)
         if len(free) > len(known):
             yield taught._replace(map=revised(known, free))
 
 
 def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now: Situation) -> Judged:
-    """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words. If what is
-    in the way may go again, it is waited for, as long as that gives up no more. Where no future is better
-    than to stand for ever, contacts and what led nowhere are set aside: they may be why.
+    """If no motion is feasible, `judged` with the action that keeps most of the rule as its completion, and
+    warnings that say what that gives up.
 
-    told: the shield on the policy's map; shield: on the session's own.
+    If the obstacles in the way may go again, the robot waits for that, as long as it gives up no more by
+    waiting. If no future is better than standing for ever, contacts and the motions that led nowhere are set
+    aside, since they may be the reason. told: the shield on the policy's map; shield: on the session's own.
     """
     if judged.some or not recovers(shield.config):
         return judged
     tried = judged.tried
     first, lost, said, helps = most_kept(shield, judged.part, tried)
     parts, able = lost, [each for each in shield.proposers if hasattr(each, "giving_up")]
-    for alone in (True, False) if able and len(parts) > 1 else ():  # a part may be kept without the others
+    for alone in (True, False) if able and len(parts) > 1 else ():  # keep one part alone, then all but one
         few = [tuple(each for each in parts if (each == one) != alone) for one in parts[:MOST_PARTS]]
         asked = [adapted(each, "giving_up", some) for some in few for each in able]
         tried = together(tried, futures(now.prefix, shield.body, asked, None, (0.0,)))
         first, lost, said, helps = most_kept(shield, judged.part, tried)
-        if len(parts) == 2 or lost == parts:  # where none can be kept alone, no two can
+        if len(parts) == 2 or lost == parts:  # if no part can be kept alone, no two can
             break
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
-    elif not helps:  # what is believed of contacts may be why
+    elif not helps:  # contacts may be the reason
         known, marked = taught.map, taught.map.occupied & (taught.map.by != SENT)
         believed = marked.any() or len(taught.barred) > 0
         free = on_map(told, revised(known, forget(known, marked))) if believed else shield
@@ -101,12 +104,12 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         first = first if helps else ways.preferred
         if believed:
             said = ("what contacts taught leaves no way, so it is ignored for this action", *said)
-    tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # the futures that were judged, no more
+    tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # only the futures that were judged
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
 def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
-    """The futures that begin with this motion, and the one that waits after it for ever."""
+    """The futures that begin with the motion `first`, and the one that then waits to the horizon."""
     still = np.full_like(tried.motions[:1], told.task.robot.wait_motion)
     still[0, 0] = first
     motions = np.concatenate([tried.motions[tried.motions[:, 0] == first], still])
@@ -114,8 +117,8 @@ def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
 
 
 def _awaited(told: Shield, shield: Shield, taught: Taught, now: Situation) -> int | None:
-    """The first motion of the way that there would be if all that came in the way were gone; the one that
-    waits where something known hinders that motion. None where there is no such way, or no such motion.
+    """The first motion of the way that there would be if every learned obstacle were gone, or the waiting
+    motion if one of them hinders that motion. None if there is no such way, or the robot cannot wait.
     """
     known, wait = taught.map, told.task.robot.wait_motion
     if not known.occupied.any() or wait < 0:

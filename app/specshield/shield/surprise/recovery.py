@@ -1,8 +1,8 @@
-"""What to do where no future keeps the whole rule, and what the answer says of it.
+"""What to do if no future keeps the whole rule, and what the answer says of it.
 
-After a surprise, or once a part of the rule is lost, the other parts are kept: the safest first, which are
-those of the form G, then the soonest. Of the futures that keep as much, the one goes first that comes
-nearest to the first part that is given up: what was not found by a search may still turn out to be there.
+After a surprise, or once a part of the rule is lost, the other parts are kept: first the safest, which are
+those of the form G, then those that end soonest. Among futures that keep the same parts, the one is chosen
+that comes nearest to the first part given up, since a way to keep that part may still be found later.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts, verdict
 
 
 def recovers(config: Config) -> bool:
-    """Whether a session's world may be another than it was told: elsewhere all is as in the paper."""
+    """Whether a session expects that robot or map are not as told. Other sessions do as the paper says."""
     return config.uncertainty is not None or config.learn_map
 
 
 def most_kept(
     shield: Shield, prefix: Prefix, tried: Futures
 ) -> tuple[int, tuple[Formula, ...], tuple[str, ...], bool]:
-    """The first motion of the future that keeps most of `prefix.formula`, the parts that it gives up, the
-    safest first, a sentence for each of them, and whether that is better than to stand for ever.
+    """The first motion of the future that keeps most of `prefix.formula`; the parts that it gives up, the
+    safest first; a sentence for each of these; and whether the future is better than standing for ever.
     """
     whole = np.empty((len(tried.motions) + 1, *tried.poses.shape[1:]))
     whole[-1] = prefix.poses[-1]

@@ -1,4 +1,4 @@
-"""What a robot that has slipped goes on with: the way that it had begun, from its beginning."""
+"""A robot that has slipped can begin the way that it was on again, at its beginning."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
 @dataclass(frozen=True)
 class Begun:
-    """Proposes ways that begin at x_t, motions [N, T - t], or what is left of them later on."""
+    """Proposes given ways from x_t, motions [N, T - t]; at later steps, what is left of them."""
 
     task: Task
     motions: Ints
     id = "the way that was begun"
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        rest = self.motions[:, len(history) - self.task.horizon - 1 :]  # too short for an earlier step's
+        rest = self.motions[:, len(history) - self.task.horizon - 1 :]  # before x_t too short: refused
         return Proposal(rest, int(rest[0, 0]))
 
 
 def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
-    """The shield with what proposes the certified way of the action that was drawn last, where the robot
-    stands where it stood though that action leads elsewhere. The same shield where it has moved, or its
-    motions are taken to be exact. poses [t + 1, 3].
+    """If the robot stands where it stood, though the action that was drawn last leads elsewhere: the shield
+    with one more proposer, of that action's certified way. Otherwise, or if motions are taken to be exact,
+    the same shield. poses [t + 1, 3].
     """
     task, uncertain = shield.task, shield.config.uncertainty is not None
     if not uncertain or carry is None or carry.t != len(poses) - 2 or carry.action is None:

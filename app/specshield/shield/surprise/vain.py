@@ -1,8 +1,8 @@
 """What a robot tried in vain: from which poses which motions led nowhere.
 
-A mark on the map does not always say why a motion led nowhere. The footprint may be told wrong, and marks are
-doubted and forgotten. So what was tried is remembered beside them, and no future goes by it again where
-another keeps the rule: else a robot turns away and back for ever.
+A mark on the map does not always explain why a motion led nowhere: the footprint may be told wrong, and marks
+are doubted and forgotten. So such motions are remembered beside the marks, and futures avoid them as long as
+one without them keeps the rule. Otherwise a robot may turn away and back for ever.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from specshield.shield.decision import Stuck
 from specshield.shield.surprise.contact import Near
 
 MOST_STUCK = 16  # motions of each kind that are remembered, the newest of them
-# What hinders a motion hinders it from poses so near, too: two turns of a Stretch, a cell of 5 cm. By hand.
+# [m], [rad] A motion that led nowhere does so from poses this near too. Two turns of a Stretch; by hand.
 ALIKE: Near = (0.05, math.radians(12.0))
 
 
@@ -30,17 +30,17 @@ def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> i
 
 
 def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """What is remembered, and that a motion leads nowhere from a pose (3,) [m, m, rad]."""
+    """`stuck`, and that a motion leads nowhere from a pose (3,)."""
     return _newest((*worked(stuck, pose, motion, near), (*pose.tolist(), motion)))
 
 
 def did_nothing(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """What is remembered, and that a motion did nothing at a pose (3,), but may only have slipped."""
+    """`stuck`, and that a motion did nothing at a pose (3,), but may only have slipped."""
     return _newest((*stuck, (*pose.tolist(), ~motion)))
 
 
 def worked(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """What is remembered, without a motion that has now led away from a pose (3,)."""
+    """`stuck` without a motion that has now led away from a pose (3,)."""
     return tuple(each for each in stuck if each[3] not in (motion, ~motion) or not _is_at(each, pose, near))
 
 
@@ -54,8 +54,6 @@ def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
 
 
 def barred_by(stuck: Iterable[Stuck], near: Near) -> Floats:
-    """The motions that lead nowhere for sure, as robot/barred.py has them. Shape [n, 6]. near: what noise
-    explains.
-    """
+    """The motions that surely lead nowhere, [n, 6] (robot/barred.py). near: what noise explains."""
     found = [(*each, *np.maximum(near, ALIKE)) for each in stuck if each[3] >= 0]
     return np.array(found, np.float64).reshape(-1, 6)
