@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt, label
 from specshield.arrays import Bools, Codes, Floats, Int8s
 from specshield.compiled import kernel, leaf
 from specshield.policy.geodesic import downhill, falling, geodesic_distance
+from specshield.robot.body import in_grid
 from specshield.robot.dynamics import Body, swing_radius
 from specshield.world.occupancy import OccupancyGrid
 
@@ -91,8 +92,5 @@ def _steer(height: Floats, way: Int8s) -> None:
 @leaf
 def cell_of(body: Body, goals: Goals, x: float, y: float) -> tuple[int, int]:
     """Row and column of the goals' grid at a point of the map frame; the nearest cell for one outside."""
-    dx, dy = x - body.origin_x, y - body.origin_y
-    u = (body.cos_yaw * dx + body.sin_yaw * dy) / goals.pitch
-    v = (body.cos_yaw * dy - body.sin_yaw * dx) / goals.pitch
-    height, width = goals.distance.shape[1], goals.distance.shape[2]
-    return min(max(int(v), 0), height - 1), min(max(int(u), 0), width - 1)
+    (u, v), (_, height, width) = in_grid(body, x, y), goals.distance.shape
+    return min(max(int(v / goals.pitch), 0), height - 1), min(max(int(u / goals.pitch), 0), width - 1)

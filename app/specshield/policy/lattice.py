@@ -19,6 +19,7 @@ from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import Rules
 from specshield.policy.progress.values import fill_place, fill_signals
 from specshield.policy.shape import heading_count, side_of
+from specshield.robot.body import in_grid
 from specshield.robot.dynamics import (
     TOUCH,
     Body,
@@ -121,11 +122,9 @@ def coordinates(
     body: Body, pitch: float, headings: int, x: float, y: float, theta: float
 ) -> tuple[float, float, float]:
     """Lattice coordinates (v, u, heading in [0, H)) of a pose of the map frame."""
-    dx, dy = x - body.origin_x, y - body.origin_y
-    u = (body.cos_yaw * dx + body.sin_yaw * dy) / pitch - 0.5
-    v = (body.cos_yaw * dy - body.sin_yaw * dx) / pitch - 0.5
+    u, v = in_grid(body, x, y)
     h = theta * headings / (2.0 * math.pi)
-    return v, u, h if h >= 0.0 else h + headings
+    return v / pitch - 0.5, u / pitch - 0.5, h if h >= 0.0 else h + headings
 
 
 @inlined

@@ -1,6 +1,6 @@
-"""The robot on its map as the compiled functions take it, and what can be asked of its motions.
+"""The robot on its map as the compiled functions take it, and questions about its motions.
 
-A motion is an index into `Robot.motions`: go straight on, then turn on the spot, either of them by nothing.
+A motion is an index into `Robot.motions`: go straight on, then turn on the spot. Either part may be zero.
 """
 
 from __future__ import annotations
@@ -96,8 +96,7 @@ def turning_motion(body: Body) -> int:
 
 
 def calmest_motion(body: Body) -> int:
-    """The motion that stands still, or what comes nearest: the smallest turn on the spot, else the shortest
-    move."""
+    """The motion that stands still, or else the smallest turn on the spot, or else the shortest move."""
     travel = np.abs(body.translate) + 1e-3 * np.abs(body.rotate)
     return int(np.argmin(travel))
 
@@ -113,9 +112,14 @@ def wrap(theta: float) -> float:
 
 
 @inlined
-def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
-    """The footprint's centre in grid metres: along the grid's columns and rows from its lower-left corner."""
-    c, s = math.cos(theta), math.sin(theta)
-    dx = x + body.offset_x * c - body.offset_y * s - body.origin_x
-    dy = y + body.offset_x * s + body.offset_y * c - body.origin_y
+def in_grid(body: Body, x: float, y: float) -> tuple[float, float]:
+    """A point of the map in grid metres: along the grid's columns and rows from its lower-left corner."""
+    dx, dy = x - body.origin_x, y - body.origin_y
     return body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
+
+
+@inlined
+def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
+    """The footprint's centre in grid metres."""
+    c, s = math.cos(theta), math.sin(theta)
+    return in_grid(body, x + body.offset_x * c - body.offset_y * s, y + body.offset_x * s + body.offset_y * c)

@@ -14,13 +14,13 @@ import math
 import numpy as np
 
 from specshield.compiled import inlined, leaf
-from specshield.robot.body import Body, centre
+from specshield.robot.body import Body, centre, in_grid
 
 TOUCH = 1e-6  # [m] a footprint that overlaps by less than this is not in collision (poses travel as text)
 SKIN = 1e-7  # [m] how far before the first contact a stopped move ends
 ROUNDING = 1e-9  # [m] slack against rounding: sliding along a wall is not a contact
 CHORD = math.radians(6.0)  # [rad] between the places of a turn at which depths inside obstacles are compared
-MAX_DEPTH = 32  # [cells] deeper inside obstacles than this is all one: what lies beyond is not searched
+MAX_DEPTH = 32  # [cells] places deeper inside obstacles count as this deep
 
 
 @inlined
@@ -32,7 +32,7 @@ def _is_occupied(body: Body, row: int, col: int) -> bool:
 
 @inlined
 def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
-    """Row and column of a point (grid metres), held to the ring: one far off fits no integer."""
+    """Row and column of a point (grid metres). Points off the map get a cell of the ring around it."""
     h, (height, width) = body.resolution, body.occupied.shape
     return math.floor(min(max(v / h, -1.0), height)), math.floor(min(max(u / h, -1.0), width))
 
@@ -48,7 +48,9 @@ def _span(body: Body, low: float, high: float, cells: int) -> tuple[int, int]:
 
 @inlined
 def room_around(body: Body, u: float, v: float) -> float:
-    """How far around a point (grid metres) the clearance field alone shows it free [m]; -inf inside one."""
+    """How far around a point (grid metres) the clearance field alone shows free space [m]; -inf for a point
+    inside an obstacle.
+    """
     h = body.resolution
     row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):
@@ -83,7 +85,7 @@ def _depth(body: Body, u: float, v: float) -> float:
     """How far inside occupied space a point lies [m]: to the nearest free square, MAX_DEPTH cells at most."""
     h, (height, width) = body.resolution, body.occupied.shape
     most = MAX_DEPTH * h
-    if max(-u, u - width * h, -v, v - height * h) >= most:  # off the map, as far as that from any square
+    if max(-u, u - width * h, -v, v - height * h) >= most:  # so far off the map
         return most
     row, col = _cell(body, u, v)
     half = 4
@@ -114,6 +116,7 @@ def _enters_slab(p: float, d: float, low: float, high: float) -> tuple[float, fl
 def _enters_box(
     pu: float, pv: float, du: float, dv: float, u0: float, u1: float, v0: float, v1: float
 ) -> float:
+    """The least s >= 0 at which p + s d is inside the box (u0, u1) x (v0, v1), inf for none."""
     a0, a1 = _enters_slab(pu, du, u0, u1)
     b0, b1 = _enters_slab(pv, dv, v0, v1)
     enter, leave = max(a0, b0), min(a1, b1)
@@ -124,7 +127,7 @@ def _enters_box(
 
 @leaf
 def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: float, r: float) -> float:
-    """(du, dv) is a unit vector."""
+    """The least s >= 0 at which p + s d is inside the disc about (cu, cv), inf for none; d of length 1."""
     qu, qv = pu - cu, pv - cv
     along = qu * du + qv * dv
     gap = qu * qu + qv * qv - r * r
@@ -177,8 +180,7 @@ def way_ahead(body: Body, x: float, y: float, theta: float, distance: float) -> 
     gap = free_distance(body, u, v, body.radius)
     if gap == 0.0:
         return sign * _escape(body, u, v, du, dv, length)
-    # The radius tested is never more than the gap there is: what overlaps already may slide or leave, not go
-    # deeper.
+    # The radius tested is at most the present gap: what overlaps already may slide or leave, not go deeper.
     r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
     contact = _first_contact(body, u, v, du, dv, length, r)
     if contact == np.inf:
@@ -188,7 +190,7 @@ def way_ahead(body: Body, x: float, y: float, theta: float, distance: float) -> 
 
 @leaf
 def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float) -> float:
-    """From a centre inside an obstacle: as far as the way never leads deeper, in steps of a quarter cell."""
+    """From a centre inside an obstacle: as far as the way leads no deeper [m], by steps of a quarter cell."""
     n = math.ceil(length / (0.25 * body.resolution))
     depth = _depth(body, u, v)
     for k in range(1, n + 1):
@@ -254,6 +256,7 @@ def _to_square(u: float, v: float, u0: float, v0: float, h: float) -> float:
 
 @leaf
 def can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool:
+    """Whether the robot can turn on the spot by an angle [rad]."""
     if body.offset_x == 0.0 and body.offset_y == 0.0:
         return True
     u, v = centre(body, x, y, theta)
@@ -262,9 +265,7 @@ def can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool
     gap = free_distance(body, u, v, body.radius)
     if gap > 0.0:
         r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
-        dx, dy = x - body.origin_x, y - body.origin_y
-        ou, ov = body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
-        return not _arc_contact(body, ou, ov, u, v, angle, r)
+        return not _arc_contact(body, *in_grid(body, x, y), u, v, angle, r)
     inside, n = _depth(body, u, v), math.ceil(abs(angle) / CHORD - 1e-9)
     for k in range(1, n + 1):
         if _depth(body, *centre(body, x, y, theta + angle * k / n)) > inside + ROUNDING:

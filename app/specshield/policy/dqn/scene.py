@@ -23,6 +23,7 @@ from specshield.policy.progress import (
     read_predicates,
     value_count,
 )
+from specshield.robot.body import in_grid
 from specshield.robot.dynamics import Body, longest_motions, make_body
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import STACK_SIZE, VALUE
@@ -111,11 +112,9 @@ def between(scene: Scene, x: float, y: float) -> tuple[int, int, float, float]:
     Points beyond the outermost centres count as lying on the edge of the map.
     """
     body, height, width = scene.body, scene.distance.shape[1], scene.distance.shape[2]
-    dx, dy = x - body.origin_x, y - body.origin_y
-    u = (body.cos_yaw * dx + body.sin_yaw * dy) / body.resolution - 0.5
-    v = (body.cos_yaw * dy - body.sin_yaw * dx) / body.resolution - 0.5
-    u = min(max(u, 0.0), width - 1.0)
-    v = min(max(v, 0.0), height - 1.0)
+    u, v = in_grid(body, x, y)
+    u = min(max(u / body.resolution - 0.5, 0.0), width - 1.0)
+    v = min(max(v / body.resolution - 0.5, 0.0), height - 1.0)
     i, j = max(min(int(u), width - 2), 0), max(min(int(v), height - 2), 0)
     return j, i, v - j, u - i
 
