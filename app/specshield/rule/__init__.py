@@ -1,1 +1,1 @@
-"""What a formula says of a trajectory: its leaves and bounds, its progress, what is left of it."""
+"""What a formula says of a trajectory: its robustness and bounds, what is open, what is left of it."""

@@ -1,10 +1,10 @@
-"""What a prefix leaves open of a formula, with each F and U met some steps early.
+"""The robustness of what a prefix leaves open of a formula, with each deadline met some steps early.
 
-What the prefix has settled is left out; a visit may have to be robust to count. An F or U is asked for so
-many steps before its window ends, or where it is met already. What a G that has yet to begin asks for is
-asked for so many steps before it, and so is what a short window far away asks for; another G at the top
-counts from the first step on at which its child is open. Below a `not`, a G is an F in other words, and an F
-a G.
+Conjuncts that the prefix has settled are left out; a visit may need some robustness to count. An F or U has
+to be met so many steps before its window ends, unless the prefix has met it. What a G asks for has to hold
+from so many steps before the G begins, and likewise for an F whose window is short and far away. A G at the
+top that has begun counts from the first step at which its child is open. Below a `not`, a G is treated as an
+F and an F as a G.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from specshield.stl.conjunction import flat, is_predicate
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
 
-OTHER = -1  # beside a tree's operators
+OTHER = -1  # the kind of a conjunct that is neither F nor G
 
 
 class Conjuncts(NamedTuple):
-    """A conjunction of K formulas, over the leaves of its tree.
+    """A conjunction of K formulas, over the l leaves of its tree.
 
-    below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
-    OTHER: none, all is in `below`. at [K]: where in the buffer the values in its window begin. a, b [K]: its
-    window [steps]. horizon [K]: of what is below [steps]. lead [K]: half of the time until its window if that
-    `is_far`, else 0 [steps]. half [K]: half of the longest window of an F or U in it, or of the time until a
-    window in `below` that is far [steps]. plain [K]: whether what is below is a predicate, or under F a G of
-    one. owner [n]: each node's conjunct; -1 where nothing can be asked for early. seeker [l]: the conjunct of
-    each leaf that an F or U seeks to be true, -1 of any other.
+    below: the tree of n nodes without the `and`, and without the F or G at the top of each conjunct. kind
+    [K]: ALWAYS or EVENTUALLY for that G or F; OTHER: the whole conjunct is in `below`. at [K]: where in the
+    buffer the values in its window begin. a, b [K]: its window [steps]. horizon [K]: of its child [steps].
+    lead [K]: half of the time until its window if that `is_far`, else 0 [steps]. half [K]: the most slack of
+    the rest, which is half of the longest window of an F or U, or of the time until a window in `below` that
+    is far [steps]. plain [K]: whether the child is a predicate or, under F, a G of one. owner [n]: the
+    conjunct of each node; -1 for a node that cannot be met early. seeker [l]: the conjunct of a leaf that has
+    to be true at some step of an F or U, -1 for any other leaf.
     """
 
     below: Tree
@@ -53,7 +54,7 @@ class Conjuncts(NamedTuple):
 
 @kept_with_task
 def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts]:
-    """The formula's conjuncts, and the view that has their leaves; None where that is the formula's own."""
+    """The formula's conjuncts, and the view that has their leaves; None if that is the formula's own view."""
     above = (formula,) if is_predicate(formula) else conjuncts(formula)  # as in the tree
     above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
     whole, slots = joined(above), places(task)
@@ -91,11 +92,11 @@ def _is_plain(part: Formula) -> bool:
 def find_open(
     parts: Conjuncts, known: Floats, t: int, visits: Floats, still: Bools, settled: Floats
 ) -> Floats:
-    """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t.
-    Returns the least that each node may have, by x_{0:t}.
+    """Writes into still (K,) which conjuncts x_{0:t} has not settled, and into settled (K,) above which
+    robustness past visits count for each conjunct. Returns the lower bounds of all nodes, (size,).
 
-    visits (K,): a visit behind counts if its robustness is above this, as long as one can yet be so robust.
-    settled (K,): written, above which robustness each conjunct's visits count now.
+    known (size,): the leaves to step t. visits (K,): the robustness above which past visits are to count; a
+    conjunct that can no longer be so robust counts every visit.
     """
     low, high = known.copy(), known.copy()
     bounds_at(parts.below, t, low, high)
@@ -103,7 +104,7 @@ def find_open(
         had = _value(parts, k, parts.a[k], parts.b[k], high) > visits[k]
         settled[k] = visits[k] if had else SATISFIED_ABOVE
     copy_row(known, low)
-    if not _settle(parts, t, settled, low):  # then nothing is settled by less
+    if not _settle(parts, t, settled, low):  # every past visit counts anyway
         settled[:] = SATISFIED_ABOVE
     bounds_at(parts.below, t, low, low.copy())
     for k in range(still.shape[0]):
@@ -113,8 +114,9 @@ def find_open(
 
 @leaf
 def _settle(parts: Conjuncts, t: int, settled: Floats, buffer: Floats) -> bool:
-    """Each leaf to step t in `buffer` (size,) becomes inf where it counts, -inf where it does not hold; what
-    holds and does not count keeps its value. Returns whether there is any. settled (K,): as in `find_open`.
+    """In `buffer` (size,), sets the leaves to step t to inf where they count and to -inf where they do not
+    hold. Leaves that hold but do not count keep their values; returns whether there are any. settled (K,):
+    see `find_open`.
     """
     less = False
     for n in range(parts.below.leaf_at.shape[0]):
@@ -134,11 +136,11 @@ def _settle(parts: Conjuncts, t: int, settled: Floats, buffer: Floats) -> bool:
 def rate_open(
     parts: Conjuncts, still: Bools, t: int, settled: Floats, early: Ints, leaves: Floats, rho: Floats
 ) -> None:
-    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end,
-    though a window keeps at least half its length, and what a window that is far asks for kept before it.
+    """Writes rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before
+    its end, though a window keeps at least half its length; what a window that is far asks for has to hold as
+    many steps before it. If nothing is open, rho is that of the whole formula.
 
-    settled (K,): as `find_open` has it. leaves (N, size): the leaves along N trajectories. Where nothing is
-    open, rho is that of the whole.
+    settled (K,): see `find_open`. leaves (N, size): the leaves along N trajectories.
     """
     buffer, scratch, some = np.empty(leaves.shape[1]), np.empty(leaves.shape[1]), still.any()
     for f in range(leaves.shape[0]):
@@ -166,7 +168,7 @@ def rate_open(
 
 @leaf
 def _apply_early(tree: Tree, n: int, t: int, early: int, buffer: Floats, scratch: Floats) -> None:
-    """Applies node n below the conjuncts as `rate_open` says. buffer, scratch (size,): both overwritten."""
+    """Applies node n of `parts.below` as `rate_open` says. buffer, scratch (size,): both overwritten."""
     op, at, right, count, a, b = tree.op[n], tree.at[n], tree.right[n], tree.length[n], tree.a[n], tree.b[n]
     turned, past = tree.turned[n], t - tree.start[n]
     seeks = (op == ALWAYS) == turned
@@ -191,7 +193,7 @@ def _apply_early(tree: Tree, n: int, t: int, early: int, buffer: Floats, scratch
 
 @leaf
 def _value(parts: Conjuncts, k: int, a: int, b: int, buffer: Floats) -> float:
-    """rho of conjunct k, with the window [a, b] for its own, from what is below it."""
+    """rho of conjunct k from the values of its child, with the window [a, b] in place of its own."""
     first = parts.at[k] - parts.a[k]
     value = buffer[first + a]
     for i in range(first + a + 1, first + b + 1):

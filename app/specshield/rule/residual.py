@@ -9,7 +9,7 @@ from specshield.stl import Always, And, Formula, conjuncts, verdict
 
 
 def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:
-    """The conjuncts that can still be kept, and the broken G of which some step can be kept yet."""
+    """The conjuncts that can still be kept, and the broken G that can be enforced again from step t + 1."""
     kept: list[Formula] = []
     broken: list[Always] = []
     for conjunct in conjuncts(formula):
@@ -21,8 +21,8 @@ def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[l
 
 
 def again(broken: Sequence[Always], t: int, early: int = 0) -> list[Formula]:
-    """The broken G that look as far as step t, each enforced from step t on, or at its last step at least.
-    early: from so many steps before t on, but only where the child, at that step, looks as far as t.
+    """The broken G whose horizon reaches step t, each enforced from step t on, at its last step at least.
+    early: begin so many steps sooner, but not where the child looks only at steps before t.
     """
     first = [max(each.a, t - min(early, each.child.horizon)) for each in broken]
     ways = zip(first, broken, strict=True)

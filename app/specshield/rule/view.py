@@ -35,7 +35,7 @@ class View(NamedTuple):
 
 @kept_with_task
 def view_of(task: Task, formula: Formula, ahead: bool = False) -> View:
-    """The formula, or a part of it, prepared once. ahead: as `compile_tree` has it; then no leaf binds."""
+    """The formula, or a part of it, prepared once. ahead: see `compile_tree`; no leaf binds then."""
     names = list(task.areas)
     tree = compile_tree(formula, places(task), ahead)
     first, last = np.full(len(names), np.iinfo(np.int64).max), np.full(len(names), -1)
@@ -76,11 +76,11 @@ def read_step(
     stack: Floats,
     buffer: Floats,
 ) -> float:
-    """The leaves at step start + k, at poses[k], into `buffer`. What is unchanged is not read again.
+    """Writes the leaves at step start + k, at poses[k], into `buffer`. What is unchanged is not read again.
 
-    poses (n, 3), the first of them at step `start`; signals (m, S): of the same steps, the last held. Returns
-    the least value of the leaves that bind, inf where none does, NaN where some leaf is no number. values
-    (`value_count`,), stack: scratch, left as they are between the steps.
+    poses (n, 3): the first is at step `start`; signals (m, S): at the same steps, the last row is held.
+    Returns the least value of the leaves that bind, inf if none does, NaN if some leaf is not a number.
+    values (`value_count`,), stack: scratch, to be left as they are between the steps.
     """
     tree, regions, held = view.tree, view.first.shape[0], signals.shape[0] - 1
     t, x, y, theta = start + k, poses[k, 0], poses[k, 1], poses[k, 2]
@@ -116,7 +116,7 @@ def read_step(
 def _read(
     view: View, poses: Floats, signals: Floats, start: int, values: Floats, stack: Floats, buffer: Floats
 ) -> bool:
-    """`read_step` for all poses (n, 3); False where some leaf is no number."""
+    """`read_step` for all poses (n, 3); returns False if some leaf is not a number."""
     for k in range(poses.shape[0]):
         if math.isnan(read_step(view, poses, signals, start, k, values, stack, buffer)):
             return False

@@ -1,11 +1,10 @@
 """The values of signals that ask the most of a robot, so that what is kept under them is kept under any.
 
-A rule as `G[0,100] (event > 0.5 -> F[0,60] Dock)` asks nothing while the event stays away. It asks the most
-where the event is there at every step. In general: every part of a formula that reads signals alone stands
-where it helps to be true, or where it helps to be false. At the worst values no such part helps. Then a
-trajectory that satisfies the formula does so by its poses and by what is past. So it does whatever else the
-signals do: rho is a minimum and maximum of such parts, and parts at or below 0 are none of those that make it
-positive.
+A rule such as `G[0,100] (event > 0.5 -> F[0,60] Dock)` asks for nothing while there is no event. It asks for
+the most if there is one at every step. In general, each part of a formula that reads signals alone helps the
+formula either by being true or by being false. At the worst values no such part helps. Then a trajectory that
+satisfies the formula does so by its poses and its past alone, and therefore satisfies it whatever the signals
+do: rho is made of minima and maxima of the parts, and no part at or below 0 makes it positive.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from specshield.errors import SampleError
 from specshield.stl import SATISFIED_ABOVE, Comparison, Formula, Implies, Node, Not, Number, robustness
 from specshield.task import Task, kept_with_task
 
-MOST_TRIED = 4096  # combinations of values of signals that are read together. Chosen by hand
+MOST_TRIED = 4096  # combinations of values, for signals that are read together. Chosen by hand
 
 
 @kept_with_task
 def worst_signals(task: Task) -> Floats | None:
     """The worst values [1, S], in the order of `task.signals`, each held for ever.
 
-    None where there is nothing to guarantee against or no such values were found: the formula reads no
-    signals, joins signals and the pose in one comparison, or has parts that are not at their worst together.
+    None if the formula reads no signals, or no such values were found: it compares signals with the pose, or
+    has parts that are not at their worst together.
     """
     found = list(_parts(task.formula, frozenset(task.signals), True))
     parts = [part for part in found if part is not None]
@@ -37,7 +36,7 @@ def worst_signals(task: Task) -> Floats | None:
     held, left = dict(task.signals), set(task.signals)
     while left:
         group = {left.pop()}
-        while True:  # what is read together is chosen together
+        while True:  # the values of signals that are read together are chosen together
             asked = [part for part in parts if group & set(part[0].names)]
             names = group.union(*(part[0].names for part in asked))
             if names == group:
