@@ -1,6 +1,6 @@
-"""Motions that are known to lead nowhere from some poses, whatever f says.
+"""Barred motions: they led nowhere from some poses, whatever f says.
 
-They are rows x, y, theta, motion, and how near another pose has to be to be taken for the same: [m], [rad].
+Each is a row: x, y, theta, motion, and how near another pose has to be to count as the same, [m] and [rad].
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def is_barred(barred: Floats, x: float, y: float, theta: float, motion: int) -> 
 
 @kernel
 def in_vain(barred: Floats, pose: Floats, motions: Ints, poses: Floats, whole: bool) -> Bools:
-    """[N]: the futures from a pose (3,) that go by a motion from where it led nowhere.
+    """Which futures from a pose (3,) make a barred motion. Shape [N].
 
-    motions [N, L], poses [N, L, 3]: they, and where they lead. whole: look at every step; else only
-    until the robot is elsewhere. barred [n, 6].
+    motions [N, L], poses [N, L, 3]: the futures, and where they lead. whole: look at every step; else only
+    at the steps before the robot first moves. barred [n, 6].
     """
     found = np.zeros(motions.shape[0], np.bool_)
     for i in range(motions.shape[0]):

@@ -14,8 +14,8 @@ its dynamics knows what each of them does. A dynamics offers:
 
 Which motions take another one back (policy/undo.py) follows from the displacements.
 
-All but the queries on whole robots are compiled, and compiled anew for each type of `Body`, together with
-what calls them: nothing is dispatched while a decision is made.
+All but `make_body`, `displacements` and `calmest_motion` are compiled, anew for each type of `Body`, together
+with their callers: nothing is dispatched while a decision is made.
 """
 
 from specshield.robot.body import (

@@ -1,4 +1,4 @@
-"""What is taken as it is sent, and looks like a mistake: degrees, a place off the map, a jump."""
+"""Warnings about input that is accepted but looks like a mistake: degrees, a place off the map, a jump."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from specshield.robot.actions import Robot
 from specshield.robot.dynamics import Body, longest_motions
 from specshield.world.occupancy import OccupancyGrid
 
-FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] some count headings up to here; nobody counts on
+FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] no convention for headings goes beyond it
 JUMP = 1.0  # [m] beyond the longest motion: more than robots slip. Chosen by hand
 
 
 def oddities(grid: OccupancyGrid, body: Body, poses: Floats) -> Iterator[str]:
-    """What looks odd of x_t, one sentence each. poses [t + 1, 3]: as they were sent, headings not wrapped."""
+    """What looks odd about x_t, one sentence each. poses [t + 1, 3]: as sent, headings not wrapped."""
     x, y, theta = poses[-1].tolist()
     if abs(theta) > FULL_TURN:
         meant = math.radians(theta)
@@ -32,7 +32,7 @@ def oddities(grid: OccupancyGrid, body: Body, poses: Floats) -> Iterator[str]:
 
 
 def odd_turns(robot: Robot) -> Iterator[str]:
-    """What looks odd of the robot's turns, one sentence each."""
+    """What looks odd about the robot's turns, one sentence each."""
     for name, turn in ((action.name, action.rotate) for action in robot.actions):
         if abs(turn) > math.pi:
             meant = f"{turn:g} degrees would be {math.radians(turn):.4g} radians"

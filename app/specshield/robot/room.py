@@ -1,7 +1,7 @@
 """Room beside its way for a robot that cannot drive backwards.
 
-Where such a robot ends up between obstacles that are a little nearer than its map has them, it may fit
-neither on nor around. So it is asked to go where a footprint that is somewhat larger would go just as well.
+If such a robot ends up between obstacles that are a little nearer than on its map, it may be able neither to
+go on nor to turn round. So futures are preferred on which a somewhat larger footprint would go just as well.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ def widened(body: Body) -> Body:
 
 @kernel
 def has_room(wide: Body, pose: Floats, motions: Ints, poses: Floats) -> Bools:
-    """[N]: the futures from a pose (3,) that lead the larger robot where they lead the robot itself.
+    """Which futures from a pose (3,) lead the larger robot where they lead the robot itself. Shape [N].
 
-    motions [N, L], poses [N, L, 3]: they, and where they lead the robot.
+    motions [N, L], poses [N, L, 3]: the futures, and where they lead the robot.
     """
     found = np.ones(motions.shape[0], np.bool_)
     for i in range(motions.shape[0]):
