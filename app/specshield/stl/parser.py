@@ -15,8 +15,9 @@
     product    = factor { ("*" | "/") factor }
     factor     = "-" factor | number | name | "abs" "(" sum ")" | "(" sum ")"
     window     = "[" bound ("," | ":") bound "]"                   whole steps, 0 <= a <= b
-               | ("touches" | "inside") "(" name ")"              how the robot's footprint lies to a region
-    name       = letter or "_", then letters, digits, "_"; not a keyword
+    name       = word
+               | ("touches" | "inside") "(" word ")"               how the robot's footprint lies to a region
+    word       = letter or "_", then letters, digits, "_"; not a keyword
 
 So `F[0,3] a and b` is `(F[0,3] a) and b`, and `not a > 0` is `not (a > 0)`. `-3` is one number.
 
@@ -52,7 +53,7 @@ _NO_CHAIN = {
     nodes.COMPARISON: ("comparisons", "'and' between two of them"),
 }
 
-_ELSEWHERE = {  # what follows a word that is none here, and what to add
+_HINTS = {  # for a word that is no operator, by what follows it
     "[": "; with a window there are G, F and U: always, eventually, until",
     "(": "; with parentheses there are abs, touches and inside",
 }
@@ -274,13 +275,13 @@ class _Parser:
 
 
 def _hint(word: Token, following: Token) -> str:
-    """What to add for someone who wrote AND, or a word that other languages have."""
+    """What to add to an error about a word such as AND, or an operator of another language."""
     lower = word.text.lower()
     if lower != word.text and lower in KEYWORDS:
         return f"; '{lower}' is written in lower case"
     if word.text in BODY_WORDS:
         return f"; '{word.text}' takes a region in parentheses"
-    return _ELSEWHERE.get(following.kind, "") if word.kind == "name" else ""
+    return _HINTS.get(following.kind, "") if word.kind == "name" else ""
 
 
 def _clip(text: str) -> str:

@@ -39,7 +39,7 @@ _ARITHMETIC = {"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "/": DIVIDE}
 
 
 class Programs(NamedTuple):
-    """Several programs end to end; program k is at starts[k] to starts[k + 1]. starts int64[k + 1].
+    """K programs, one after the other: program k is at starts[k] to starts[k + 1]. starts int64[K + 1].
 
     ops int64[n]; args float64[n]: the number of a NUMBER, the slot of a VALUE, else 0.
     """

@@ -55,8 +55,8 @@ def may_fail(node: Node) -> bool:
 
 @np.errstate(all="ignore")
 def interval(term: Term, read: Callable[[str], Interval] = lambda name: (-np.inf, np.inf)) -> Interval:
-    """Bounds on the term's value by interval arithmetic, as numbers or arrays, where `read` gives those on a
-    name; unless it is given, every name may be any real number.
+    """Bounds on the term's value by interval arithmetic, as numbers or arrays. `read` gives the bounds on a
+    name; by default every name may be any real number.
     """
     match term:
         case Number(number):

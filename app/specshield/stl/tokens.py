@@ -15,7 +15,7 @@ _WORDS = {"!": "not", "&": "and", "|": "or", "->": "implies", "always": "G", "ev
 _NO_EQUALITY = "a comparison: <, <=, > or >=; for equality a tolerance, such as abs(x - 2) < 0.1"
 _UNEQUAL = "a comparison, such as abs(x - 2) > 0.1"
 _BOTH_WAYS = "'->' for each direction: (a -> b) and (b -> a)"
-_ELSEWHERE = {  # operators of programming languages and of papers, each with what to write here
+_ELSEWHERE = {  # operators of programming languages and of papers, each with what to write instead
     "&&": "'and'", "\N{LOGICAL AND}": "'and'", "/\\": "'and'",
     "||": "'or'", "\N{LOGICAL OR}": "'or'", "\\/": "'or'", "~": "'not'", "\N{NOT SIGN}": "'not'",
     "=>": "'->' between formulas, '>=' between numbers", "\N{RIGHTWARDS ARROW}": "'->'",
@@ -51,7 +51,7 @@ class Token(NamedTuple):
 
 
 def tokens(text: Any) -> list[Token]:
-    """The tokens of `text`, the last of kind "end". Raises FormulaError with the position of what is none."""
+    """The tokens of `text`, the last of kind "end". Raises FormulaError with the position of the mistake."""
     if not isinstance(text, str):
         raise wrong("a formula has to be text", type(text).__name__, "a string", 0)
     if len(text) > MAX_LENGTH:

@@ -26,13 +26,14 @@ NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
 class Tree(NamedTuple):
     """A formula at step 0, of n nodes in postfix order and l leaves. rho ends up at buffer[0].
 
-    op [n]: the operator. at, right [n]: where in the buffer its first and second operand's values begin; of
-    an F or G, where its operand's values begin, and where those in the window of its first step do. length
-    [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps. start [n]: the step of
-    its first value. turned [n]: whether an odd number of `not` stands above it.
-    leaf_at, leaf_start, leaf_stop [l]: where a leaf's values begin in the buffer, and from which step up to
-    which (excluded) they are. sought [l]: 1 where an F or U seeks a leaf to be true, below no odd number of
-    `not`, else 0. low, high [l]: bounds on a leaf's value at a step whose samples are to come. size: of the
+    op [n]: the operator. at, right [n]: where in the buffer the values of its first and second operand begin;
+    for F and G, where those of its only operand begin, and where those in the window of its first step do.
+    length [n]: how many values it has, which are written from `at` on. a, b [n]: its window, in steps. start
+    [n]: the step of its first value. turned [n]: whether it stands below an odd number of `not`.
+
+    leaf_at [l]: where a leaf's values begin in the buffer. leaf_start, leaf_stop [l]: the steps of its
+    values, `leaf_stop` excluded. sought [l]: 1 for the operand of an F, or the right side of an U, below an
+    even number of `not`; else 0. low, high [l]: bounds on its value at a step still to come. size: of the
     buffer.
     """
 
@@ -70,10 +71,10 @@ def compile_tree(formula: Formula, slots: Mapping[str, int], ahead: bool = False
 
 
 def is_far(formula: Always | Eventually, turned: bool) -> bool:
-    """Whether an F or G has to be asked for before its window to be met some steps early, and can be.
+    """Whether an F or G can only be met some steps early by what holds before its window, and can be so.
 
-    So it is where half of the time until the window is longer than that of an F, or than what is below a G
-    looks ahead. turned: whether an odd number of `not` stands above: then a G is an F, and an F a G.
+    So it is if half of the time until the window is longer than the window of an F, or than the horizon of a
+    G's child. turned: whether the formula stands below an odd number of `not`: then F and G change places.
     """
     seeks = isinstance(formula, Eventually) is not turned
     span = formula.b - formula.a if seeks else formula.child.horizon
@@ -89,8 +90,8 @@ class _Builder:
         self.size = 0
 
     def add(self, formula: Formula, start: int, stop: int, turned: bool, sought: bool = False) -> int:
-        """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin. turned:
-        as in `Tree`; sought: whether what stands above seeks it.
+        """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin. turned,
+        sought: see `Tree`.
         """
 
         def node(op: int, at: int, right: int = -1, a: int = 0, b: int = 0) -> int:
