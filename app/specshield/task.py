@@ -31,9 +31,9 @@ SIGNAL = f"a number from {-LARGEST:g} to {LARGEST:g}"
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """regions: those that the formula names, the spec's own and the map's rooms.
+    """regions: those that the formula names, both the spec's own and the map's rooms.
 
-    signals: the other signals that the formula uses, with the value that each holds before its first sample.
+    signals: the signals that the formula reads, with the value that each has before its first sample.
     """
 
     grid: OccupancyGrid
@@ -104,8 +104,8 @@ NOT_KEPT: Any = object()
 
 
 def kept_with_task(function: F) -> F:
-    """Keeps what the function returns for a task with that task, until the task goes. A cache of the
-    function's own would hold the maps of tasks that nobody uses any more.
+    """Keeps what the function returns for a task in that task's __dict__, so that it goes with the task. A
+    cache of the function's own would keep the maps of tasks that nobody uses any more.
     """
     name = f"{function.__module__}.{function.__qualname__}"
 
@@ -134,9 +134,9 @@ def make_task(
 ) -> Task:
     """Checks and joins the parts of a task.
 
-    regions: {name: region JSON or Region}, the spec's own; they and `signals` come before the map's `rooms`
-    of the same name. Raises FormulaError, MapError (regions), SampleError (signals), with the path of the
-    field below the spec.
+    regions: {name: region JSON or Region}, the spec's own. A region or a signal takes precedence over a room
+    of the map with the same name. Raises FormulaError, MapError (regions), SampleError (signals), with the
+    path of the field below the spec.
     """
     declared = parse_regions(regions or {})
     initial = parse_signals(signals or {}, declared)
@@ -155,7 +155,7 @@ def names_for(regions: Iterable[str], signals: Iterable[str]) -> list[str]:
 
 
 def parse_regions(regions: Mapping[str, Any], path: str = "regions") -> dict[str, Region]:
-    """Regions by name, from JSON or as they are. path: of the field that they are. Raises MapError."""
+    """Regions by name, from JSON or `Region`s. path: of the field that holds them. Raises MapError."""
     if len(checks.mapping(regions, path)) > MAX_REGIONS:
         raise MapError(f"too many {path}", path=path, got=len(regions), expected=f"at most {MAX_REGIONS}")
     result: dict[str, Region] = {}
@@ -183,7 +183,7 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
 
 
 def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
-    """Raises SampleError for a signal that is none of those a session's rules have read, or out of range."""
+    """Raises SampleError for a signal that none of a session's rules reads, or a value out of range."""
     for name, value in signals.items():
         where = f"signals.{name}"
         if name not in names:

@@ -23,8 +23,8 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_POINTS = 2000  # of each kind, in one step
 MAX_CELLS = 100_000  # that differ from the policy's map: 10 x 25 m of 5 cm cells, half a megabyte as bytes
-# Who changed a cell: a point that was sent, or a motion that stopped short. That marks what lies straight
-# ahead, to the left and to the right, and behind that, where the thing that stopped it may reach.
+# What changed a cell: a point that was sent, or a motion that stopped short. A motion marks cells straight
+# ahead, to the left, to the right, and behind these, as far as the obstacle may reach.
 SENT, CONTACT, LEFT, RIGHT, BEHIND = range(5)
 FEW_ROWS = 64  # of new cells: with more of them, a clearance made anew takes as long (measured, 10 x 10 m)
 
@@ -33,7 +33,7 @@ FEW_ROWS = 64  # of new cells: with more of them, a clearance made anew takes as
 class LearnedMap:
     """Changed cells, N of them.
 
-    cell [N]: row * width + column, ascending. occupied [N]: as the session has it; the policy's map has the
+    cell [N]: row * width + column, ascending. occupied [N]: on the session's map; the policy's map has the
     opposite. by [N]: SENT, CONTACT, LEFT, RIGHT or BEHIND. step [N]: at which each was seen last. revision:
     how many steps have changed a cell.
     """
@@ -46,7 +46,7 @@ class LearnedMap:
 
     @cached_property
     def digest(self) -> bytes:
-        """Names the cells and what they are, whoever changed them and when."""
+        """A hash of the cells and whether they are occupied, whatever changed them and when."""
         return blake2b(
             self.cell.astype("<i8").tobytes() + np.packbits(self.occupied).tobytes(), digest_size=16
         ).digest()
@@ -103,7 +103,7 @@ def learn(
 ) -> LearnedMap:
     """What is known once `cells` [n], ascending, were found occupied or free at step t. Same revision.
 
-    A cell that is as the policy's map has it is not kept, nor is one beyond MAX_CELLS.
+    Cells that agree with the policy's map are not kept, and no more than MAX_CELLS are.
     """
     if not len(cells):
         return known
@@ -121,7 +121,7 @@ def learn(
 
 
 def forget(known: LearnedMap, old: Bools) -> LearnedMap:
-    """Without the cells that `old` [N] says. Same revision."""
+    """`known` without the cells marked in `old` [N]. Same revision."""
     return _rows(known, ~old) if old.any() else known
 
 
@@ -132,7 +132,7 @@ def _rows(known: LearnedMap, which: Bools | Ints) -> LearnedMap:
 
 
 def revised(before: LearnedMap, after: LearnedMap) -> LearnedMap:
-    """`after`, with the next revision where some cell is not what it was `before`."""
+    """`after`, with the next revision if some cell is not what it was `before`."""
     return replace(after, revision=before.revision + (before.digest != after.digest))
 
 
@@ -154,8 +154,8 @@ def applied(grid: OccupancyGrid, known: LearnedMap) -> OccupancyGrid:
 
 @kernel
 def _come_nearer(clearance: Floats, cells: Ints, rows: Ints, farthest: float, resolution: float) -> None:
-    """Takes cells [n] that became occupied, in these rows, into the clearance [height, width], which is
-    `farthest` [m] at most. Half cells are counted as in `OccupancyGrid.clearance`, to the same last bit.
+    """Takes cells [n] that became occupied, in these rows, into the clearance [height, width], whose greatest
+    value is `farthest` [m]. It counts half cells as `OccupancyGrid.clearance` does, to the same last bit.
     """
     height, width = clearance.shape
     reach = int(farthest / resolution) + 2

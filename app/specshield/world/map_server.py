@@ -1,7 +1,8 @@
 """Maps of ROS's map_server: a YAML file with an image.
 
-They give a value per cell, -1 for unknown and 0 to 100 for how occupied it is in percent, as nav2_map_server
-publishes it; FREE_AT_MOST then says which cells are free. Everything else, the unknown included, is occupied.
+The two give a value for each cell, -1 for unknown and 0 to 100 for how occupied it is in percent, as
+nav2_map_server publishes it. Cells up to FREE_AT_MOST are free; all others, the unknown included, are
+occupied.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from specshield.world.occupancy import MAX_SIDE, OccupancyGrid, check_size
 
 FREE_AT_MOST = 25  # percent: what nav2's map_saver writes as free by default
 MAX_YAML = 16_384  # characters; a map's YAML has some 150
-FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] a map's yaw beyond it is one in degrees
+FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] a larger yaw is taken to be in degrees
 UNKNOWN = -1
 MODES = ("trinary", "scale", "raw")
 
@@ -83,8 +84,8 @@ def from_values(values: NDArray[Any], resolution: float, origin: tuple[float, fl
 
 
 class _Loader(yaml.SafeLoader):
-    """Loads plain data alone, and refuses aliases, which can make a short text grow without bound, and a
-    member that is there twice, of which ROS takes the first and PyYAML the last.
+    """Loads plain data alone. It refuses aliases, which can make a short text grow without bound, and a
+    member that is given twice, of which ROS takes the first and PyYAML the last.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -168,7 +169,7 @@ def text_of(metadata: bytes) -> str:
 
 
 def parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:
-    """As it is sent. A server's own files may have been kept before a yaw in degrees was refused."""
+    """The map that was sent. A yaw in degrees is refused here alone: maps that a server kept may have one."""
     grid = load_map(text_of(metadata), image)
     if abs(grid.origin[2]) > FULL_TURN:
         raise checks.wrong("yaw", "origin[2]", grid.origin[2], "radians, from -2 pi to 2 pi")
