@@ -1,10 +1,10 @@
 """How kernels are compiled: cached on disk, without the interpreter's lock, never fastmath.
 
-numba keeps what it compiled under the file of the function alone. A kernel made of others would go on with
-what they were before they changed, and an upgrade with old code: so each module's kernels have a folder of
-their own, named after its source and that of all it imports from here. Neither the path nor the time of a
-file counts, and the processor is one that nearly all machines have. So a wheel can bring its kernels
-(`make wheels`), and an image may be built on another machine than it runs on.
+numba keeps compiled code by the file of the function alone. After a change, or an upgrade, a kernel would go
+on with the old code of the kernels that it calls. So each module's kernels have a folder of their own, named
+after a hash of its source and that of all modules of this package that it imports. The path and the time of a
+file do not count, and the code is for a processor that nearly all machines have. So a wheel can bring its
+kernels (`make wheels`), and an image may be built on another machine than it runs on.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ unliteral: Any = numba.types.unliteral
 F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).parent
 SHIPPED = PACKAGE / "kernels"  # what a wheel brings
-# Every x86-64 processor with AVX2 is at least one of these (the x86-64 psABI, section 3.1.1). NUMBA_CPU_NAME
-# names another.
+# The processor that kernels are compiled for: nearly every x86-64 one with AVX2 has all that this level asks
+# for (the x86-64 psABI, section 3.1.1). NUMBA_CPU_NAME names another.
 COMMON, HAS = "x86-64-v3", ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 IMPORTED = re.compile(
     r"^ *(?:from|import) +(specshield[\w.]*)(?: +import +(\([^)]*\)|[^\n]*))?", re.MULTILINE
@@ -63,25 +63,25 @@ def kernel(function: F) -> F:
 
 
 def leaf(function: F) -> F:
-    """A compiled function that allocates nothing: called in inner loops, with structs of arrays.
+    """A compiled function that allocates nothing, to be called in inner loops with structs of arrays.
 
-    numba counts a reference for each array of a struct at each call, with atomic operations: most of
-    a rollout's time. What allocates nothing needs no counting. The option is not in numba's manual; where it
-    is gone, the kernels are slower and the same.
+    At each call numba counts a reference to each array of a struct, with atomic operations that take most of
+    a rollout's time. A function that allocates nothing needs no counting. The option for that is not in
+    numba's manual; without it, the kernels do the same, more slowly.
     """
     return _leaf(function)
 
 
 def inlined(function: F) -> F:
-    """A leaf that becomes part of its callers: a call copies a struct's hundred words, in an inner loop most
-    of its time.
+    """A leaf that is compiled into its callers. A call would copy the hundred words of a struct, which takes
+    most of the time of an inner loop.
     """
     return _leaf(function, forceinline=True)
 
 
 def mark(name: str) -> Path | None:
-    """A file to be made once everything called `name` is compiled: another where the sources, the processor
-    or numba are others. None where no kernel can be kept.
+    """The file whose existence says that the kernels called `name` are compiled and kept. Other sources, or
+    another processor or numba, have another file. None if no kernel can be kept.
     """
     made_of = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(PACKAGE.rglob("*.py"))]
     processor = config.CPU_NAME or get_host_cpu_name() + _found.flatten()
@@ -111,11 +111,11 @@ def _leaf(function: F, **options: bool) -> F:
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Compiles a function once for each combination of types it is called with, once more where Python calls
-    it and kernels do too.
+    """Compiles a function once for each combination of argument types, and once more if both Python and
+    kernels call it.
 
-    A number that is written in a call counts as any other of its type. Left alone, numba compiles the callee
-    once more for each such number, which took a sixth of all the time that compiling takes.
+    A literal number in a call counts as any other number of its type. By itself, numba would compile the
+    callee once more for each such number, which took a sixth of the whole time.
     """
     compiled = called = _kept(njit(cache=True, pipeline_class=linking.Entry, **options)(function))
     if function.__closure__ is None:
@@ -139,7 +139,7 @@ def _kept(compiled: Any) -> Any:
 
 
 class _BySource(_CacheLocator):
-    """Tells numba where this package's kernels are kept, and that they hold as long as their folder does."""
+    """Tells numba where this package's kernels are kept, and that they stay valid in a folder of one name."""
 
     def __init__(self, folder: Path, line: int) -> None:
         self._folder, self._line = folder, line
@@ -164,8 +164,8 @@ CacheImpl._locator_classes.insert(0, _BySource)
 
 @cache
 def _folder(module: str) -> Path:
-    """Where a module's kernels are kept; what was kept of an older source goes. What the wheel brought is
-    copied there, or taken where it is if nothing can be written.
+    """The folder of a module's kernels. Folders for older sources are removed. Kernels from a wheel are
+    copied into it, or used where they are if nothing can be written.
     """
     found, to_see = set[Path](), [module]
     while to_see:
@@ -187,7 +187,7 @@ def _folder(module: str) -> Path:
 
 
 def _copy(folder: Path, to: Path) -> None:
-    """Copies it whole, or not at all where another process was first."""
+    """Copies a folder whole, or not at all if another process was first."""
     with TemporaryDirectory(dir=BASE) as beside:
         shutil.copytree(folder, Path(beside) / "copy")
         with contextlib.suppress(OSError):

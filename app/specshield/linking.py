@@ -1,8 +1,8 @@
 """Kernels as other kernels call them: each is compiled once, however many call it.
 
-numba writes every kernel into all that call it, optimises it there again, and gives it what Python needs to
-call it: three quarters of what LLVM had to do. Here a long kernel stays on its own, and those that call it
-name its symbol. It is the same in every process, and what comes from the disk first loads all that it calls.
+numba writes every kernel into each of its callers, optimises it there again, and adds what Python needs to
+call it. That was three quarters of LLVM's work. Here a long kernel stays on its own, and its callers name its
+symbol. The symbol is the same in every process. A kernel from the disk first loads all kernels that it calls.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from numba.core.runtime.nrt import rtsys
 njit: Any = numba.njit  # its types leave out the options
 Base: Any = compiler.Compiler
 Function = Callable[..., Any]
-# [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
-# first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
+# [optimised instructions of LLVM] Shorter kernels are still written into their callers. With 250 the first
+# start took as long, and decisions 1.013 times as long (`python -m benchmarks.episodes --against`).
 LONG = 700
-_callees: dict[tuple[str, str], Any] = {}  # by module and name
-_symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each stands for
+_callees: dict[tuple[str, str], Any] = {}  # kernels as `callee` returns them, by module and name
+_symbols: dict[str, tuple[Any, ...]] = {}  # the argument types that each symbol stands for
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Any:
-    """As numba does it, but without importing its own modules: that takes 0.3 s, and no kernel needs them."""
+    """numba's function, but it does not import numba's own modules: that takes 0.3 s and is not needed."""
     spared = module.startswith("numba.") and module not in sys.modules
     return _rebuild_env("numba" if spared else module, constants, name)
 
 
 _rebuild_env: Any = environment._rebuild_env
-# By its own name it would stand in the caches of others, which could not be read without this package then.
+# With the name of numba's function, so that caches which refer to it can be read without this package.
 environment._rebuild_env = update_wrapper(_environment, _rebuild_env)
 
 
 class Entry(Base):  # type: ignore[misc]
-    """Compiles what Python calls: C does not."""
+    """Compiles what Python calls, without the wrapper for C."""
 
     def compile_extra(self, function: Function) -> Any:
         self.state.flags.no_cfunc_wrapper = True
@@ -71,11 +71,11 @@ class _Callee(Entry):
 
 
 class _GoneError(Exception):
-    """What a kernel on the disk calls is not to be had any more."""
+    """A kernel that one from the disk calls cannot be had any more."""
 
 
 class _Needed(NamedTuple):
-    """Sees to it that a symbol is there which a kernel from the disk calls."""
+    """When called, makes sure that a symbol is loaded which a kernel from the disk calls."""
 
     module: str
     name: str
@@ -92,7 +92,7 @@ class _Needed(NamedTuple):
 
 
 def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], Any]) -> Any:
-    """The function as kernels call it; `kept` sees to its cache."""
+    """The function as other kernels call it. kept: prepares the cache of what numba returns."""
     compiled = kept(njit(cache=True, pipeline_class=_Callee, **options)(function))
     _callees[function.__module__, function.__qualname__] = compiled
     cache = compiled._cache
@@ -114,8 +114,8 @@ def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], An
 
 
 def entry(compiled: Any) -> None:
-    """From now on, the disk keeps this without the code that callers would write into themselves: kernels
-    call its `callee`, not this. Reading that code took a twelfth of a start with every kernel on the disk.
+    """From now on, this is kept on the disk without the code that callers would include, since kernels call
+    its `callee` instead. Reading that code took a twelfth of a start with every kernel on the disk.
     """
     save = compiled._cache.save_overload
 
@@ -134,7 +134,7 @@ def entry(compiled: Any) -> None:
 
 
 def _load_whole(compiled: Any) -> None:
-    """From now on, what this takes from the disk loads all that it calls, or is compiled anew."""
+    """From now on, a kernel from the disk also loads all kernels that it calls, or is compiled anew."""
     load = compiled._cache._load_overload
 
     def load_with_callees(types: Any, context: Any) -> Any:

@@ -1,12 +1,12 @@
-"""Things that are known by name: those of the project, and those that other packages add.
+"""Methods, map formats and preferences by name: those of the project, and those that other packages add.
 
 A package adds one as an entry point. For a method of its own, `pyproject.toml` says
 
     [project.entry-points."specshield.methods"]
     sweep = "my_package.sweep:METHOD"
 
-and once the package is installed, `sweep` can be asked for wherever `planner` can. Nothing is imported
-before it is asked for.
+and once the package is installed, `sweep` can be named wherever `planner` can. A module is imported when its
+entry is first asked for.
 """
 
 from __future__ import annotations
@@ -27,8 +27,9 @@ log = logging.getLogger("specshield")
 class Registry(Generic[E]):
     """Entries of one type by name.
 
-    word: what one entry is called. group: of the entry points that add to it. built_in: where each of the
-    project's own is, as "module:attribute". field: of a request that names an entry; by default the word.
+    word: what one entry is called in messages. cls: the type of the entries. group: of the entry points that
+    add entries. built_in: where each entry of the project is, as "module:attribute". field: the field of a
+    request that names an entry; by default the word.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class Registry(Generic[E]):
 
     @cached_property
     def _points(self) -> dict[str, EntryPoint]:
-        """By name. A name that the project uses itself stays the project's."""
+        """The entry points by name. A name that the project uses itself stays the project's."""
         own = {name: EntryPoint(name, where, self._group) for name, where in self._built_in.items()}
         added = {point.name: point for point in entry_points(group=self._group)}
         for name in own.keys() & added.keys():
