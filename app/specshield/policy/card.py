@@ -20,7 +20,7 @@ FORMAT = 1  # the version of the card's members; no other version exists yet, so
 
 @dataclass(frozen=True, eq=False)
 class Carded:
-    """What all policies have that come with a card."""
+    """Base of the policies that come with a card."""
 
     task: Task
     card: Card
@@ -53,7 +53,7 @@ def make_card(
     metrics: measured figures, among them `wall_time_s`. spec: the spec as the caller gave it; by default the
     canonical formula and every region that it uses, the map's rooms included.
     """
-    if not spec:  # one that needs neither the map's rooms nor anything else
+    if not spec:  # one that can be read without the map's rooms
         regions = {name: region_to_json(region) for name, region in task.regions.items()}
         spec = {"formula": str(task.formula), "regions": regions}
         spec |= {"signals": dict(task.signals)} if task.signals else {}

@@ -1,7 +1,7 @@
-"""From a first motion onto a way that is already known: by undoing the motion, or because another motion led
-to the same place.
+"""How a first motion can join a way that is already known: by undoing the motion, or because another motion
+led to the same place.
 
-Near a wall many motions end in the same pose. Arcs of one length end in the same place, turned differently.
+Near a wall many motions end in the same pose. Arcs of one length end in the same place, with other headings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def is_same_pose(pose: Floats, other: Floats) -> bool:
 
 @leaf
 def copy_ways(motions: Ints, poses: Floats, twin: Ints) -> None:
-    """Gives each motion what follows its twin (M,). motions (M, n), poses (M, n, 3)."""
+    """Copies to each motion what follows its twin (M,). motions (M, n), poses (M, n, 3)."""
     for m in range(twin.shape[0]):
         if twin[m] != m:
             for i in range(1, motions.shape[1]):
@@ -40,12 +40,12 @@ def copy_ways(motions: Ints, poses: Floats, twin: Ints) -> None:
 
 @leaf
 def find_sibling(body: Body, poses: Floats, known: Ints, motion: int, waits: bool, out: Ints) -> None:
-    """How to come onto the way of one of the motions `known` that ends at the place where `motion` does.
+    """How to join the way of one of the motions `known`, which ends at the place where `motion` does.
 
-    Writes into out (3,): that other motion, -1 where there is none; the turn to make, NOT_NEEDED where the
-    heading fits; and after how many motions of its way the robot is then on it. Where that way begins with
-    turns, they are made at once. A robot that cannot wait (`waits` is false) may not be there sooner than the
-    other. poses (M, n, 3): of each motion's way.
+    Writes into out (3,): that other motion, -1 for none; the turn to make, NOT_NEEDED if the heading fits;
+    and after how many motions of its way the robot joins it. If that way begins with turns, one turn replaces
+    them. A robot that cannot wait (`waits` is false) may not be ahead of the way that it joins. poses (M, n,
+    3): of each motion's way.
     """
     out[0] = -1
     for k in range(known.shape[0]):
@@ -65,8 +65,8 @@ def join(turn: int, move: int, base: Ints, at: int, wait: int, motions: Ints) ->
     """Writes what follows the first of motions (T - t,): `turn` and `move` (or NOT_NEEDED), which lead to
     where `base` (T - t,) is after its first `at` motions, then the rest of `base`.
 
-    Steps that are lost are made up for by leaving out waits of `base`; steps that are gained are waited for.
-    wait: the motion that waits, -1 for a robot that cannot; it may not gain any.
+    A robot that is late leaves out waits of `base`; one that is early waits. wait: the motion that waits, -1
+    for a robot that cannot, which may not be early.
     """
     n, steps, behind = 1, motions.shape[0], 1 - at
     for extra in (turn, move):

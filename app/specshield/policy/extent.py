@@ -21,16 +21,16 @@ from specshield.task import Task
 
 # Of a lattice: 3 s to make on one core, and 10 MB a table (python -m benchmarks.floors).
 MOST_POSES = 5_000_000
-MOST_ENTRIES = 10_000_000  # of the tables of a floor with more poses: 20 MB, unless that takes ROUGH
+MOST_ENTRIES = 10_000_000  # of the tables of a floor with more poses, as far as the pitch stays below ROUGH
 ROUGH = 2.0  # times the pitch that was asked for
 MOST_STEPS = 40_000_000  # poses times motions, each of which takes up to 10 bytes while tables are made
 COARSEST = 4.0  # times the pitch that was asked for; beyond it doors are missed
 
 
 def fitting_pitch(task: Task, pitch: float, entries: int, most: int, share: float = 1.0) -> float:
-    """The smallest pitch from `pitch` [m] on whose lattice is not too large, with `entries` in the tables for
-    each pose and at most `most` of them. share: of the map that is covered. Callers refuse what is beyond
-    COARSEST.
+    """The smallest pitch, `pitch` or more [m], whose lattice is not too large. entries: of the tables, for
+    each pose; most: how many entries there may be; share: of the map that the lattice covers. Callers refuse
+    results beyond COARSEST.
     """
     headings = headings_of(task)
     allowed = min(MOST_POSES, MOST_STEPS // len(task.robot.motions), most / entries)
@@ -47,8 +47,8 @@ def fitting_pitch(task: Task, pitch: float, entries: int, most: int, share: floa
 def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bools:
     """The cells [ny, nx] at which a trajectory that keeps the rule can be, as far as its goals tell.
 
-    Where every goal is settled and no `always` is still to begin or to end, a robot that can wait needs no
-    table either.
+    Once every goal is settled and no `always` is still to begin or to end, a robot that can wait needs no
+    table any more, so later steps do not count.
     """
     ny, nx = side_of(task.grid, pitch)
     kept = np.ones((ny, nx), np.bool_)

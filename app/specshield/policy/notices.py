@@ -1,5 +1,5 @@
-"""The warnings of a new policy: no start keeps its rule, it misses starts, or a part asks for nothing; and
-turns of its robot that look like degrees.
+"""The warnings about a new policy: that no start keeps its rule, that it misses starts, that a part of the
+rule asks for nothing, or that turns of its robot look like degrees.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from specshield.shield.episode import start
 from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
 
-STARTS = 16  # poses that a new policy is tried from. Chosen by hand: as with all of it, a second or two
-MOST_SEARCHED = 4  # of those that it has no future from
+STARTS = 16  # poses that a new policy is tried from. By hand, so that all of this takes a second or two.
+MOST_SEARCHED = 4  # of those from which it has no future
 
 
 def notices(policy: Proposer) -> tuple[str, ...]:
@@ -56,8 +56,8 @@ def _of_rule(policy: Proposer) -> tuple[str, ...]:
 
 
 def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
-    """What is said of a rule that signals may make harder. silent: of how many starts it is kept if they stay
-    as they are.
+    """Warnings about a rule that signals may make harder to keep. silent: from how many starts the rule can
+    be kept if the signals stay as they are.
     """
     if worst_signals(shield.task) is None:
         return (

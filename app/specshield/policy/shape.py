@@ -12,15 +12,15 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_HEADINGS = 120
 FEWEST_HEADINGS, USUAL_HEADINGS = 24, 72  # where none fits every turn exactly: 15 to 5 degrees each
-# How far a turn may be off a multiple [headings], so as not to count and to count as little: after ten turns
-# NEAR_HEADING is half a heading. Chosen by hand.
+# [headings] How far a turn may be off a multiple of a heading to count as exact, and as nearly exact: ten
+# turns that are off by NEAR_HEADING make half a heading. Chosen by hand.
 SAME_HEADING, NEAR_HEADING = 1e-3, 0.05
 
 
 def heading_count(rotations: list[float]) -> int:
-    """The fewest headings, 4 to MAX_HEADINGS, that every rotation [rad] is nearly a multiple of.
+    """The fewest headings, 4 to MAX_HEADINGS, of which every rotation [rad] is exactly a multiple.
 
-    Where there are none, the fewest from FEWEST_HEADINGS on that rotations err by little; at most
+    If there are none, the fewest from FEWEST_HEADINGS on of which every rotation is nearly a multiple, else
     USUAL_HEADINGS.
     """
 

@@ -24,7 +24,7 @@ class Tree(NamedTuple):
     """N poses [N, 3], the root first, each with its progress, status and run [N, K]; the motions made up to
     it, its parent and the motion that led to it, [N].
 
-    heap: the rows to go on from. table: where poses are looked up, at most half full; -1 where no row is.
+    heap: the rows to go on from. table: a hash table of rows, at most half full, -1 where it is empty.
     """
 
     pose: Floats
@@ -63,7 +63,7 @@ def make_tree(most: int, obligations: int) -> Tree:
 
 @inlined
 def put(tree: Tree, row: int, x: float, y: float, theta: float, made: int, parent: int, motion: int) -> None:
-    """Writes a pose and how it was come to; the progress there is left as it is."""
+    """Writes a row's pose, and how it was reached; the progress of the row is left as it is."""
     tree.pose[row, 0], tree.pose[row, 1], tree.pose[row, 2] = x, y, theta
     tree.made[row], tree.parent[row], tree.motion[row] = made, parent, motion
 
@@ -76,11 +76,11 @@ def first_slot(tree: Tree, key: int) -> int:
 
 @leaf
 def is_new(tree: Tree, row: int, grain: float, sooner: bool) -> bool:
-    """Whether no row that is remembered has nearly the same pose and the same progress; where `sooner`, none
-    that was reached in as few motions. The row is then remembered.
+    """Whether no row in the table has nearly the same pose and the same progress; if `sooner`, none that was
+    reached in as few motions either. The row is then put into the table.
 
-    grain: poses that differ by less [m], and by less than a degree, are nearly the same. Only rows of one
-    grain are compared.
+    grain: poses that differ by less [m], and by less than a degree, are nearly the same. Only rows with the
+    same grain are compared.
     """
     x, y, h = _rounded(tree.pose, row, grain)
     key = x * 73856093 ^ y * 19349663 ^ h * 83492791
@@ -145,8 +145,9 @@ def pop(heap: Heap, size: int) -> int:
 
 @inlined
 def sink(heap: Heap, hole: int, size: int, row: int, rank: float) -> None:
-    """Puts a row into heap[:size] at `hole` or below, the lowest row first on ties. The hole goes down to the
-    end first and the row up from there, where it mostly belongs: fewer branches that cannot be foreseen.
+    """Puts a row into heap[:size] at `hole` or below, the lowest row first on ties. The hole first moves down
+    to the end, then the row moves up from there. It mostly belongs near the end, so few branches are
+    mispredicted.
     """
     at = hole
     while 2 * at + 1 < size:

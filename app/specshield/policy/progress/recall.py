@@ -1,5 +1,5 @@
-"""What a policy makes of the states behind it: what counts as settled for a margin, and what is left once
-something broke.
+"""The progress that a policy plans with: what the past has settled for a margin, and what is left to do once
+an obligation is broken.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Present(NamedTuple):
 
 @kernel
 def recall(rules: Rules, past: Past) -> Present:
-    """As `replay`, but the states x_0..x_t have to keep their own margin instead of the rules'.
+    """As `replay`, but by the margin of `past`, which may be another than that of the rules.
 
-    By the rules' margin, what can have it no more counts by what it has: J asks for it elsewhere.
-    J asks the rules' margin of every step of a dwell. So of a dwell that has begun only the steps that keep
-    that margin count. Where it is too late to begin the dwell anew, all steps that keep their own do.
+    If it is the same, an obligation that can no longer be kept by the margin counts by margin 0, since J does
+    not ask it for more. If it is another, a dwell that has begun counts only the steps that keep the rules'
+    margin, which J asks of every step of a dwell, unless it is too late to begin the dwell anew.
     """
     margin, poses, signals = past
     status, run = replay(rules, margin, poses, signals)
@@ -56,17 +56,17 @@ def recall(rules: Rules, past: Past) -> Present:
 
 @kernel
 def resume(rules: Rules, past: Past) -> Present:
-    """As `recall`, with what broke by x_t forgiven."""
+    """As `recall`, with `forgive` applied to what broke by x_t."""
     now = recall(rules, past)
     forgive(rules, now.t, now.status)
     return now
 
 
 def pasts(rules: Rules, poses: Floats, signals: Floats) -> list[Past]:
-    """The states x_0..x_t with each margin by which proposals have to `recall` them, given what J asks for.
+    """The states x_0..x_t, with each margin for which a proposal has to be made.
 
-    J asks that a visit behind has the rules' margin, where it can be made again; elsewhere any visit counts.
-    Where both may apply, a proposal is made for each.
+    J asks that a past visit has the rules' margin if the visit can be made again, else any visit counts. If
+    both may apply, a proposal is made for each.
     """
     less = rules.margin > 0.0 and _fall_short(rules, poses, signals)
     return [Past(margin, poses, signals) for margin in ([rules.margin, 0.0] if less else [rules.margin])]
@@ -74,7 +74,7 @@ def pasts(rules: Rules, poses: Floats, signals: Floats) -> list[Past]:
 
 @kernel
 def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> bool:
-    """Whether x_0..x_t settled something by less than the rules' margin, which it could still have."""
+    """Whether x_0..x_t settled an obligation by less than the rules' margin, which it could still get."""
     asked, _ = replay(rules, rules.margin, poses, signals)
     status, _ = replay(rules, 0.0, poses, signals)
     less = False
