@@ -28,7 +28,7 @@ MAX_TRIED = 16  # motions from a pose; of more, only those with nearly the best 
 MAX_SCORED = 64  # motions from a pose; of more, others have a score at other poses
 WIDEST_GAP, NARROWEST_GAP = 4.0, 0.1  # [steps] how far below the best score such a motion may be
 EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
-POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that round to the same multiples of its inverse count once
+POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that are equal after multiplying by this and rounding count once
 
 
 class Poses(NamedTuple):
@@ -94,7 +94,7 @@ def beam_search(
     pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
     band: a pose with less slack [steps] is given up. A way ends where every goal is settled, where one more
     goal is settled and EASY steps are to spare, or where the latest feasible time [steps] is above `target`.
-    every: one motion in so many is looked at from each pose, others from others.
+    every: from each pose one motion in so many is tried, from other poses other ones.
     Writes each root's way into motions (R, n) and its length into taken (R,), 0 where none was found.
     """
     roots, k_count = status.shape
@@ -150,7 +150,7 @@ def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Int8s, run
 def _expand(
     guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, beam: Beam, scratch: Scratch
 ) -> int:
-    """Makes motions from the first `count` poses of `here`; each new pose is written once. How many."""
+    """Makes motions from the first `count` poses of `here`. Writes each new pose once; returns how many."""
     body, rules, tables, _, _ = guide
     here, new, edges = beam.here, beam.new, beam.edges
     found, joined, turns_matter = 0, 0, reads_heading(rules.programs, rules.regions)
@@ -171,7 +171,7 @@ def _expand(
                 continue
             x, y, theta = step_from(body, before_x, before_y, before, cos, sin, room, m)
             copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-            # After a turn the corners are those of before, and mostly the predicates too.
+            # A turn does not change the corners, and mostly not the predicates either.
             stays = x == before_x and y == before_y
             if not (stays and read):
                 read_due(rules, t + n + 1, x, y, theta, scratch)
@@ -237,9 +237,8 @@ def _finish(
 
 @leaf
 def _select(found: int, n: int, open_roots: int, width: int, share: int, band: float, beam: Beam) -> int:
-    """Puts the poses to go on with into `here`, most slack first, until each root has its share. How many.
-
-    found: how many poses of `new` count. The edges to poses that are not kept are taken out.
+    """Puts the poses to go on with into `here`, most slack first, until each root has its share; returns how
+    many there are. found: how many poses `new` has. Removes the edges to poses that are not kept.
     """
     here, new, edges, place, kept, heap = beam.here, beam.new, beam.edges, beam.place, beam.kept, beam.heap
     for r in range(kept.shape[0]):

@@ -21,8 +21,8 @@ from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_
 from specshield.rule.values import REGIONS, fill_pose, fill_region
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 
-# [steps] of slack: how late an earlier deadline may seem for a way to be looked for. Of 8,200 first motions
-# that came later by the tables, 63 had a way, and 474 of 1,100 others (docs/decisions.md).
+# [steps] The least slack, by the tables, with which a way to an earlier deadline is looked for. Of 8,200
+# first motions with less slack 63 had a way, of 1,100 others 474 (docs/decisions.md).
 HURRIED = -1.0
 
 
@@ -96,7 +96,7 @@ def is_over(rules: Rules, tables: Tables, t: int, status: Int8s) -> bool:
 
 @inlined
 def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
-    """Waits where motions[:n], n >= 1, led to, to the horizon."""
+    """Writes waits from motions[n], n >= 1, to the horizon, at the pose that motions[:n] led to."""
     for rest in range(n, motions.shape[0]):
         motions[rest] = wait
         for c in range(3):
@@ -104,9 +104,10 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
 
 
 def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
-    """The guide for deadlines that come `early` steps earlier, though no window keeps less than half its
-    length: those of every F that is open at step t and can still be met so early. And whether any deadline
-    does come earlier; for a robot that cannot wait, none does.
+    """The guide for deadlines that come `early` steps earlier, and whether any deadline does come earlier.
+
+    They are those of every F that is open at step t and can still be met so early. A window keeps at least
+    half its length. For a robot that cannot wait, no deadline comes earlier.
     """
     if guide.wait < 0:
         return guide, False
@@ -117,7 +118,9 @@ def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
 
 @kernel
 def _hasten(rules: Rules, early: int, past: Past, b: Ints, c1: Ints) -> tuple[int, bool]:
-    """Brings the ends b, c1 (K,) of `hurried` forward; by how much at least [steps], and whether one is."""
+    """Brings the ends b, c1 (K,) forward as `hurried` says; returns the least change [steps] among the open
+    F, and whether any end changed.
+    """
     now = recall(rules, past)
     least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):

@@ -93,8 +93,8 @@ def _go(
     poses: Floats,
     scratch: Scratch,
 ) -> bool:
-    """Goes on from motions[:1] to the horizon; whether every goal was settled. The arguments are those of
-    `climb`.
+    """Goes on from motions[:1] to the horizon; returns whether every goal was settled. For the arguments see
+    `continue_narrow` and `climb`.
     """
     n = 1
     for _ in range(MAX_LEGS):
@@ -130,9 +130,9 @@ def _go(
 
 @leaf
 def _nearest(guide: Guide, t: int, start: int, stop: int, poses: Floats, scratch: Scratch) -> int:
-    """How many motions lead to where the latest feasible time is highest on the way from motions[:start] to
-    motions[:stop], after the last goal that is settled there. The scratch holds the progress at its
-    beginning.
+    """How many motions lead to the pose with the highest latest feasible time, on the way from
+    motions[:start] to motions[:stop] and after the last goal that is settled on it. The scratch holds the
+    progress at its beginning.
     """
     best, found, settled = HOPELESS, start, 0
     for n in range(start, stop + 1):

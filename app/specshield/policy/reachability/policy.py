@@ -49,8 +49,8 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
-MAPS, MAPS_BYTES = 8, 8_000_000  # whose distances a policy keeps, and the most that their clearances take
-FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
+MAPS, MAPS_BYTES = 8, 8_000_000  # maps whose distances a policy keeps, and how large their clearances may be
+FINE_ENTRIES = 1_000_000  # a lattice three times as fine is used if its tables have no more entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,32 +65,32 @@ class ReachabilityPolicy(Carded):
     tables: Tables
     narrow: Bools
     wide: Tables | None = None
-    told: bool = True  # whether the tables were made for the map that the policy goes by
+    told: bool = True  # whether the tables were made for the map that the policy is asked about
     guess: bool = False  # whether that is one of several maps that one decision tries
-    barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
-    early: int = 0  # [steps] as `hurried` has it
-    wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
-    brief: bool = False  # whether only the way that it would go itself is looked for, by a short search
+    barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # see `Guide`
+    early: int = 0  # [steps] see `hurried`
+    wanted: Bools | None = None  # [M] the first motions after which to propose ways; None: all of them
+    brief: bool = False  # whether it looks only for its preferred way, by a short search
 
     @cached_property
     def _rules(self) -> Rules:
         return make_rules(self.task)
 
     def on_body(self, body: Body, guess: bool = False) -> ReachabilityPolicy:
-        """The policy on another map: its tables suggest what they did, its ways are those that there are.
+        """The policy on another map: its tables stay the same, its ways are simulated on that map.
 
-        guess: whether the map is one of several that are tried in one decision. Where a short search for a
-        way around gives up, nothing else is tried then.
+        guess: whether the map is one of several that are tried in one decision. If a short search for a way
+        around gives up on such a map, nothing else is tried.
         """
         return self._but(body, told=False, guess=guess)
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
-        """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
+        """The policy without barred motions [n, 6] (robot/barred.py)."""
         return self._but(self._body, barred=barred)
 
     def earlier(self, steps: int, wanted: Bools) -> ReachabilityPolicy:
-        """The policy for deadlines that come so many steps earlier, and the first motions `wanted` [M]. It
-        proposes nothing to a robot that cannot wait, nor where its tables say that it would come too late.
+        """The policy for deadlines that come so many steps earlier, and for the first motions `wanted` [M].
+        It proposes nothing for a robot that cannot wait, or where its tables say that it would be too late.
         """
         return self._but(self._body, early=steps, wanted=wanted)
 
@@ -103,7 +103,7 @@ class ReachabilityPolicy(Carded):
         return other
 
     def briefly(self) -> ReachabilityPolicy:
-        """The policy with a smaller search around, and one way alone: for an explanation, which goes none."""
+        """The policy with a smaller search and one way alone, for explanations, which ask it often."""
         return self._but(self._body, brief=True)
 
     def keeping_clear(self) -> ReachabilityPolicy:
@@ -215,7 +215,7 @@ class ReachabilityPolicy(Carded):
         return sum(self._keeps(pose) for pose in poses) / len(poses)
 
     def _keeps(self, pose: Floats) -> bool:
-        """Whether something that is proposed from a pose at the first step keeps the rule."""
+        """Whether some proposed future from a pose (3,) at the first step keeps the rule."""
         formula, history = self.task.formula, pose.reshape(1, 3)
         try:
             prefix = prefix_of(self.task, formula, view_of(self.task, formula), history, {})
@@ -248,7 +248,7 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
 
 
 def _tables(task: Task, body: Body, rules: Rules, pitch: float, cells: Bools | None) -> tuple[Tables, Bools]:
-    """The tables for a body; the obligations they hardly see [K]. pitch, cells: as `_extent` has them."""
+    """The tables for a body, and the obligations that they hardly see [K]. pitch, cells: see `_extent`."""
     lattice = make_lattice(body, pitch, cells)
     holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
     if task.robot.wait_motion < 0:

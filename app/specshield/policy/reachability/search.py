@@ -63,8 +63,8 @@ class Starts(NamedTuple):
 
 @kernel
 def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats) -> tuple[Starts, Scratch]:
-    """Makes every motion once from x_t. Twins are wanted together; if none is, the one of most slack. The
-    arguments are those of `continue_all`.
+    """Makes every motion once from x_t. A motion whose twin is wanted becomes wanted; if none is, so does the
+    motion of most slack. The arguments are those of `continue_all`.
     """
     body, rules, (count, _) = guide.body, guide.rules, motions.shape
     now, k_count = resume(rules, past), rules.kind.shape[0]
@@ -158,8 +158,8 @@ def continue_all(
 
 @leaf
 def join_sibling(guide: Guide, t: int, known: Ints, m: int, starts: Starts, scratch: Scratch) -> bool:
-    """Goes from motion m the way of one of the motions `known` that led to the same place. Whether every goal
-    was settled.
+    """Lets motion m join the way of one of the motions `known` that led to the same place. Returns whether
+    every goal was settled.
     """
     motions, poses, found = starts.motions, starts.poses, starts.sibling
     find_sibling(guide.body, poses, known, m, True, found)
@@ -175,7 +175,7 @@ def join_sibling(guide: Guide, t: int, known: Ints, m: int, starts: Starts, scra
 @leaf
 def go_back(guide: Guide, t: int, m: int, base: Ints, led: Floats, starts: Starts, scratch: Scratch) -> bool:
     """Undoes motion m to go by `base` (T - t,), a way from x_t that leads to the poses `led` (T - t, 3).
-    Whether every goal was settled; where no motion undoes it, nothing is written.
+    Returns whether every goal was settled; if no motion undoes it, nothing is written.
     """
     turn, move = starts.turn[m], starts.move[m]
     if turn == IMPOSSIBLE:
@@ -188,8 +188,8 @@ def go_back(guide: Guide, t: int, m: int, base: Ints, led: Floats, starts: Start
 def _follow(
     guide: Guide, width: int, t: int, n: int, escapes: bool, motions: Ints, poses: Floats, scratch: Scratch
 ) -> bool:
-    """Climbs on from motions[:n]; where that gets stuck, a short beam leads out if `escapes` allows it.
-    Whether every goal was settled.
+    """Climbs on from motions[:n]; if that gets stuck, a short beam leads out, provided that `escapes` is
+    true. Returns whether every goal was settled.
     """
     outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     for _ in range(MAX_ESCAPES if escapes else 0):
@@ -227,7 +227,7 @@ def _follow(
 
 @leaf
 def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, scratch: Scratch) -> int:
-    """Appends `way` to motions[:n], to which the scratch's progress belongs; how many there are then."""
+    """Appends `way` to motions[:n], whose progress the scratch holds; returns how many there are then."""
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     for i in range(way.shape[0]):
         x, y, theta = step(guide.body, x, y, theta, way[i])
@@ -242,8 +242,8 @@ def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, 
 def _beam_out(
     guide: Guide, t: int, share: int, width: int, band: float, every: int, starts: Starts, scratch: Scratch
 ) -> None:
-    """Looks for a way after every first motion that is wanted, has none yet and a slack of at least `band`
-    [steps]. every: as `beam_search` has it.
+    """Looks for a way after every first motion that is wanted, has no way yet, and has a slack of at least
+    `band` [steps]. share, every: see `beam_search`; width: see `continue_all`.
     """
     motions, poses = starts.motions, starts.poses
     steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
@@ -268,7 +268,7 @@ def _beam_out(
                 simulate(guide.body, poses[m, n - 1], motions[m, n:], poses[m, n:])
         if guide.wait >= 0:
             known = some[starts.settled[some]]
-            if known.shape[0] == 0:  # nor will many others: those that are left share fewer beams
+            if known.shape[0] == 0:  # others will hardly have a way either, so more of them share a beam
                 most = min(2 * most, MAX_ROOTS)
             for m in rest:
                 starts.settled[m] = join_sibling(guide, t, known, m, starts, scratch)

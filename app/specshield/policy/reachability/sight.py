@@ -1,5 +1,5 @@
-"""What of a rule's predicates a lattice can hardly see: places between its crossings, windows between its
-headings.
+"""Narrow predicates, which a lattice can hardly see: places between its crossings, ranges of headings between
+its headings.
 
 Tables are made on crossings. A dock smaller than a cell, or a heading that no crossing has, holds at none of
 them, and the tables would say that nothing leads there. So such a predicate counts as kept wherever it holds
@@ -23,15 +23,16 @@ from specshield.stl.program import STACK_SIZE, VALUE
 
 # Chosen by hand. A crossing is at most 0.71 cells from any place.
 BESIDE = 0.75  # [cells] by which a place may be missed
-GRAIN = math.radians(1.5)  # [rad] between the headings that are looked at: windows of 2 degrees are seen
-CELLS_ABOUT, HEADINGS_ABOUT = 3, 2  # so far about a pose that lies well inside a predicate, the lattice sees
+GRAIN = math.radians(1.5)  # [rad] between the headings that are looked at: ranges of 2 degrees are seen
+CELLS_ABOUT, HEADINGS_ABOUT = 3, 2  # the lattice sees a predicate this near to a pose that is well inside it
 
 
 def look_closely(body: Body, rules: Rules, lattice: Lattice, holds: Bytes) -> tuple[Bytes, Bools]:
-    """`holds` with what the lattice hardly sees put in, and which obligations have such a predicate [K].
+    """`holds`, in which narrow predicates also hold near to where they do, and which obligations have such a
+    predicate [K].
 
-    holds [K, ny, nx, H]: of `holds_at`. An `always` counts only where it asks for nothing but narrow places:
-    a gap beside what a robot has to keep out of is no place to lead it to.
+    holds [K, ny, nx, H]: of `holds_at`. An `always` counts as narrow only if it holds well inside nowhere: a
+    gap beside a forbidden place is not a place to lead a robot to.
     """
     narrow = np.zeros(len(rules.kind), np.bool_)
     for k in range(len(rules.kind)):

@@ -35,9 +35,9 @@ class Tables(NamedTuple):
     cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
     1 + STEP_CODES * L. table [phases, 2^G]: which one a set of settled goals has in a phase, -1 for none.
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
-    settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: step by step; bits has
-    no steps where the tables are latest times. early [steps]: how much earlier deadlines are to be met than
-    those that the tables, of latest times, were made for.
+    settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: see stepwise.py; bits
+    has no steps if the tables are latest times. early [steps]: by how much deadlines are to be met earlier
+    than the latest times were computed for.
     """
 
     cell: Int32s
@@ -152,8 +152,8 @@ def slack_at(
 
 @leaf
 def _steps_ahead(guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch) -> float:
-    """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
-    that it would stand. SAFE once nothing is pending, HOPELESS where it is not feasible at all.
+    """How feasible a pose is by step tables: 0 to 1 at step t, and 0 to 1 more for each of DELAYS after which
+    it would still be so. SAFE once nothing is pending, HOPELESS if it is not feasible at all.
     """
     rules, tables, status = guide.rules, guide.tables, scratch.status
     progress, pending = 0, False
@@ -203,7 +203,7 @@ def _slack_with(tables: Tables, mask: int, t: int, corners: Corners, count: int,
 def _after_dwells(
     guide: Guide, mask: int, t: int, corners: Corners, count: int, h: float, scratch: Scratch
 ) -> float:
-    """The slack once a dwell that is under way at step t is over, where it was begun; -inf where none is."""
+    """The slack if the robot stays until a dwell that is under way at step t is over; -inf if none is."""
     rules, tables, best = guide.rules, guide.tables, -np.inf
     for k in range(scratch.status.shape[0]):
         if rules.kind[k] == EVENTUALLY_ALWAYS and scratch.status[k] == PENDING and scratch.run[k] > 0:
@@ -230,13 +230,13 @@ def is_broken(status: Int8s) -> bool:
 def score(
     guide: Guide, x: float, y: float, theta: float, t: int, last: int, some: tuple[int, int], scratch: Scratch
 ) -> int:
-    """L after each motion from x_t into scratch.scores, contact and the step's own progress left out: a cheap
-    order to try motions in.
+    """Writes L after each motion from x_t into scratch.scores, without contact and without the progress of
+    that step: a cheap order in which to try motions.
 
-    last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
-    some: the first motion that is looked at, and how many after it the next one; the others are HOPELESS.
-    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN where they
-    were not needed.
+    last: the motion before, -1 for none; motions that lead straight back are HOPELESS, since the tables err
+    by a little. some: the first motion that is scored, and the stride to the next; others are HOPELESS.
+    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if they were
+    not needed.
     """
     body, _, tables, wait, _ = guide
     scores, mask = scratch.scores, settled_goals(tables, scratch.status)

@@ -1,1 +1,1 @@
-"""Ways around what the tables do not know of."""
+"""Ways around obstacles that the tables do not know of."""

@@ -1,8 +1,8 @@
-"""How far it is to each goal on the map that there is, whatever the tables were made for.
+"""How far it is to each goal on the present map, whatever map the tables were made for.
 
-Where a passage is blocked, the tables still lead to it, and a search that they alone guide fills all of the
-space before it. These distances lead around. They are of a coarse grid and of places without headings: they
-say in which order to search, and what is left out since it comes too late, whatever errors the grid has.
+If a passage is blocked, the tables still lead to it, and a search that they alone guide fills all of the
+space before it. These distances lead around. They are those of a coarse grid without headings. They say in
+which order to search, and which poses to leave out, since even with the grid's errors they come too late.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from specshield.robot.body import Body, centre
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
 MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger
-SURE, ERROR = 0.95, 5.0  # any way is at least this share of the grid's distance, less so many cells; by hand
-REACH = 0.71  # [sides of a cell] that no place in a cell is farther from its centre
+SURE, ERROR = 0.95, 5.0  # a way is at least this share of the grid's distance, less this many cells; by hand
+REACH = 0.71  # [sides of a cell] no place in a cell is farther from its centre
 NO_FIELDS = np.empty((0, 1, 1))  # for a search that the tables alone lead
 
 
 def goal_cells(body: Body, rules: Rules) -> Floats:
-    """The value of each goal's predicate for a robot whose heading is 0, by what signals hold at first. Shape
-    [K, ny, nx]; -inf for an `always`.
+    """The value of each goal's predicate for heading 0 and the signals' initial values. Shape [K, ny, nx];
+    -inf for an `always`.
     """
     coarse = max(COARSE, math.ceil(math.sqrt(body.occupied.size / MOST)))
     ny, nx = (-(-side // coarse) for side in body.occupied.shape)
@@ -49,8 +49,8 @@ def _fill_goals(body: Body, rules: Rules, side: float, values: Floats) -> None:
 
 
 def distances(body: Body, goals: Floats) -> Floats:
-    """Metres from each cell to the goals [K, ny, nx] through what is free for the footprint; inf where there
-    is no way, NaN where the centres of free cells do not tell where all of a goal is. Shape [K, ny, nx].
+    """Metres from each cell to the goals [K, ny, nx] through cells that are free for the footprint; inf where
+    there is no way, NaN for a goal that the centres of free cells do not show whole. Shape [K, ny, nx].
     """
     h, (ny, nx), (height, width) = body.resolution, goals.shape[1:], body.clearance.shape
     coarse, apart = -(-height // ny), math.hypot(body.offset_x, body.offset_y)
@@ -60,7 +60,7 @@ def distances(body: Body, goals: Floats) -> Floats:
     found = np.full(goals.shape, np.nan)
     for k in range(len(goals)):
         far = geodesic_distance(free, goals[k] > 0.0, coarse * h)
-        about = far[free & (goals[k] > -REACH * coarse * h - apart)]  # where a robot in the goal may be
+        about = far[free & (goals[k] > -REACH * coarse * h - apart)]  # cells with a robot that is in the goal
         if len(about) and about.max() <= (ERROR - 2.0) * coarse * h + apart:
             beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
             found[k] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
@@ -71,9 +71,9 @@ def distances(body: Body, goals: Floats) -> Floats:
 def spare_on(
     guide: Guide, fields: Floats, stride: float, x: float, y: float, theta: float, t: int, status: Int8s
 ) -> tuple[float, float]:
-    """The steps that moves of `stride` [m] straight to any one pending goal leave, at the least; inf where
-    no distance is known. And the same at the most, whatever errors the grid has: below 0 where some goal
-    cannot be reached in time. fields [K, ny, nx]: as `distances` gives them.
+    """The steps to spare, over all pending goals at least, if the robot goes straight to one with moves of
+    `stride` [m]; inf if no distance is known. And an upper bound on the same that allows for the grid's
+    errors: below 0 if some goal cannot be reached in time. fields [K, ny, nx]: of `distances`.
     """
     body, rules, least, most = guide.body, guide.rules, math.inf, math.inf
     u, v = centre(body, x, y, theta)

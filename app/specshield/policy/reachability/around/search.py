@@ -1,10 +1,10 @@
-"""A way around what the tables do not know of: best-first search over exact motions.
+"""A way around obstacles that the tables do not know of: best-first search over exact motions.
 
 Tables that were made for another map are too hopeful where something new stands in the way: a climb runs
-into it, and a beam that keeps the poses of most slack stays there. Where cells only became occupied, the
-tables still bound what can be had, so this is A* (Hart, Nilsson and Raphael, 1968): the pose of most slack
-goes first, whatever way it lies on. A pose farther on its way goes before one that is a little better, which
-keeps the search from filling all of the free space (weighted A*, Pohl 1970).
+into it, and a beam that keeps the poses of most slack stays there. As long as cells only became occupied, the
+tables still bound the slack, so this is A* (Hart, Nilsson and Raphael, 1968): the pose of most slack goes
+first, whatever way it lies on. A pose farther on its way goes before one that is a little better, which keeps
+the search from filling all of the free space (weighted A*, Pohl 1970).
 
 A robot that cannot wait turns on the spot where another one would wait. Its tables tell step by step what is
 feasible, and not how much there is to spare: so the distances alone say which pose goes first.
@@ -57,14 +57,14 @@ from specshield.robot.dynamics import (
 )
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
-POSES = 16_384  # that one search may come to, in some 10 ms
-FEWER = 2_048  # the same, where one decision tries several maps
-INSIDE = 128  # the same, from inside an obstacle or from off the map, where each costs up to 190 us
+POSES = 16_384  # that one search may make, in some 10 ms
+FEWER = 2_048  # the same, if one decision tries several maps
+INSIDE = 128  # the same, from inside an obstacle or off the map, where each pose costs up to 190 us
 ONWARD = 0.3  # [steps] of slack that a step farther on its way is worth
-PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
+PLACE_GRAIN = 20.0  # [1/m] places that are equal after multiplying by this and rounding down count once
 HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
 BAND = -3.0  # [steps] of slack: how far the tables may err
-NO_WAY, GAVE_UP = -1, -2  # in place of a way: there is none among the poses searched; they were too many
+NO_WAY, GAVE_UP = -1, -2  # in place of a way: all poses were searched; there were too many of them
 LEGS = 8  # searches for one way, each to the next goal
 
 
@@ -84,11 +84,12 @@ def is_known(guide: Guide, past: Past, poses: Floats) -> bool:
 
 @kernel
 def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: Ints, most: int) -> int:
-    """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
-    and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
-    poses. A robot that cannot wait needs `fields`.
+    """Searches for a way from x_t to every goal. Returns its first motion, else NO_WAY, or GAVE_UP if the
+    search made `most` poses. Writes the way, and a way back onto it after each other motion, into motions
+    (M, T - t).
 
-    fields [K, ny, nx]: the distances to the goals (field.py), or none. poses (M, T - t, 3): overwritten.
+    fields [K, ny, nx]: the distances to the goals (field.py), or NO_FIELDS, which only a robot that can wait
+    can do without. poses (M, T - t, 3): overwritten.
     """
     count, steps = motions.shape
     starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
@@ -133,9 +134,9 @@ def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: 
 
 @leaf
 def _linger(guide: Guide, t: int, n: int, way: Ints, led: Floats, scratch: Scratch) -> tuple[int, int]:
-    """Turns on the spot after way[:n] while some goal that is still to be settled holds there, and to the
-    horizon where every goal is settled. Returns STUCK where another goal is next, and how many motions there
-    are then. way (T - t,) and led (T - t, 3), where it leads, are written from n on.
+    """Turns on the spot after way[:n], as long as some pending goal holds there; to the horizon if every goal
+    is settled. Returns SETTLED_ALL, FAILED, or STUCK if another goal is next; and how many motions there are
+    then. Writes way (T - t,) and led (T - t, 3), where it leads, from n on.
     """
     rules, turning = guide.rules, turning_motion(guide.body)
     x, y, theta = led[n - 1, 0], led[n - 1, 1], led[n - 1, 2]
@@ -161,8 +162,8 @@ def _linger(guide: Guide, t: int, n: int, way: Ints, led: Floats, scratch: Scrat
 def _reach(
     guide: Guide, fields: Floats, t: int, steps: int, pose: Floats, tree: Tree, scratch: Scratch
 ) -> int:
-    """The row of a pose from where a climb can go on: one more goal is settled there, or only time is needed
-    for that. Else NO_WAY or GAVE_UP. The scratch holds the progress at `pose` (3,).
+    """The row of a pose from where a climb can go on, see `_arrived`; else NO_WAY or GAVE_UP. The scratch
+    holds the progress at `pose` (3,).
     """
     body, rules, tables, _, _ = guide
     tree.table[:] = -1
@@ -170,7 +171,7 @@ def _reach(
     turns_matter = reads_heading(rules.programs, rules.regions)
     put(tree, 0, pose[0], pose[1], pose[2], 0, -1, -1)
     copy_progress(scratch.status, scratch.run, tree.status[0], tree.run[0])
-    # The tables know no way out of places narrower than their lattice: they do not bound a search from there.
+    # The tables know no way out of places narrower than their lattice, so they do not bound a search there.
     bounded = slack_at(guide, pose[0], pose[1], pose[2], t, scratch, scratch.ahead, UNKNOWN) >= BAND
     # Distances bound it too, where goals are places alone and the robot overlaps no obstacle by much.
     near = 0.5 * body.resolution
@@ -213,7 +214,7 @@ def _reach(
             ahead = slack_at(guide, x, y, theta, t + s + 1, scratch, about, known)
             spare, most = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             if (ahead < BAND and bounded) or (most < 0.0 and timed):
-                tree.table[slot] = -1  # the end of its chain; its row goes to the next pose
+                tree.table[slot] = -1  # it is the last of its chain, so it can go; its row is used again
                 continue
             ahead = max(ahead, BAND) if guide.wait >= 0 or ahead >= SAFE or spare == math.inf else spare
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
@@ -255,8 +256,8 @@ def _has_time(rules: Rules, t: int, status: Int8s, run: Ints, goal: int) -> bool
 
 @leaf
 def _slot_of(tree: Tree, i: int) -> int:
-    """Where in the tree's table row `i` is remembered from now on; -1 where an earlier row has its place,
-    heading and progress.
+    """Puts row `i` into the tree's table and returns its slot; -1 if an earlier row has the same place,
+    heading and progress in as few motions.
     """
     x, y, h = _rounded(tree.pose, i)
     slot: int = first_slot(tree, x * 73856093 ^ y * 19349663 ^ h * 83492791)
