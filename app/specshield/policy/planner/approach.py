@@ -29,10 +29,10 @@ SAME_POSE = 0.05  # [m + rad] poses that differ by less than this count once in 
 
 @inlined
 def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: int, need: Ints) -> int:
-    """Goes on from motions[:n] down field f to where literal k holds; how many motions there are then.
+    """Goes on from motions[:n] down field f to where literal k holds, and keeps what has to hold on the way,
+    need (L, 4). Returns how many motions there are then, -1 if `stop` motions do not lead there.
 
-    -1 where it does not come there by motions[:stop]. What has to hold does on the way, need (L, 4). waits:
-    whether to stay where the way down would break that, instead of going round.
+    waits: whether the robot stays, instead of going round, where the way down would break what has to hold.
     """
     body, scores, motions, poses = world.body, way.scores, way.motions, way.poses
     begin, best, best_n, detours = n, np.inf, n, 0
@@ -121,7 +121,7 @@ def descend_by_beam(
             last = trail[i - 1, w, 1]
             moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
             if shortest > 0:
-                moved = turned = 0.0  # there is time to go to and fro
+                moved = turned = 0.0  # there is time, so it may go to and fro
             before = places[i - 1, w]
             for m in range(motion_count(body)):
                 d, angle = displacement(body, m)
@@ -162,8 +162,8 @@ def _insert(
     parent: int,
     motion: int,
 ) -> int:
-    """Puts a pose among the `kept` ones of a beam's step, those with the fewest steps to go first, unless it
-    is among them; returns how many there are then. places [width, 4], trail [width, 2].
+    """Puts a pose among the `kept` poses of a beam's step, in the order of the steps to go, unless one of
+    them is the same; returns how many there are then. places [width, 4], trail [width, 2].
     """
     for w in range(kept):
         if abs(places[w, 0] - x) + abs(places[w, 1] - y) + abs(places[w, 2] - theta) < SAME_POSE:
@@ -181,7 +181,7 @@ def _insert(
 
 @leaf
 def _write(world: World, way: Way, n: int, steps: int) -> None:
-    """Writes the best of a beam's ways of so many steps on from motions[:n]."""
+    """Appends the best way of a beam, of so many steps, to motions[:n]."""
     w = 0
     for i in range(steps, 0, -1):
         way.motions[n + i - 1] = way.trail[i, w, 1]
@@ -195,8 +195,8 @@ def _write(world: World, way: Way, n: int, steps: int) -> None:
 
 @leaf
 def linger(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> None:
-    """Stays from motions[:n] to motions[:stop]. A robot that cannot stay moves about near where literal k
-    holds, so that it holds in the end.
+    """Stays from motions[:n] to motions[:stop]. A robot that cannot stay moves about near to where literal k
+    holds, so that the literal holds in the end.
     """
     if world.stands:
         stay(world, way, n, stop)

@@ -1,9 +1,9 @@
 """Due dates: by which step a literal has to hold, and when it must not fail, after a prefix.
 
-This works for any formula and needs no tables. A literal is supposed to fail at some of the steps to come,
-everything else is left unknown, and the sound upper bound on rho tells whether the formula could still be
-satisfied. Where it could not, the literal is due. Bisection finds the step from which on that is so. Signals
-are supposed to hold their last value.
+This works for any formula and needs no tables. Suppose that a literal fails at some of the steps to come and
+that everything else is unknown: the sound upper bound on rho then says whether the formula could still be
+satisfied. If it could not, the literal is due. Bisection finds the step from which on that is so. Signals are
+taken to keep their last value.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read_pose(
 
 @leaf
 def read_signals(literals: PackedLiterals, values: Floats, stack: Floats, held: Floats) -> None:
-    """The value that each leaf which reads signals alone keeps, into held (l,); 0 for the other leaves."""
+    """Writes the constant value of each leaf that reads signals alone into held (l,), 0 for other leaves."""
     for n in range(held.shape[0]):
         held[n] = 0.0
         if literals.leaf[n, 0] < 0:
@@ -69,7 +69,7 @@ def note(literals: PackedLiterals, t: int, rho: Floats, held: Floats, known: Flo
 
 @leaf
 def foresee(literals: PackedLiterals, s: int, known: Floats, held: Floats, bounds: Bounds) -> None:
-    """The leaves' bounds after a prefix that ends with step s, into bounds.low and bounds.high."""
+    """Writes the leaves' bounds after a prefix that ends with step s into bounds.low and bounds.high."""
     tree, low, high = literals.formula.tree, bounds.low, bounds.high
     for n in range(held.shape[0]):
         at = tree.leaf_at[n] - tree.leaf_start[n]
@@ -132,9 +132,9 @@ def _suppose(
 
 @leaf
 def due_date(literals: PackedLiterals, k: int, s: int, guess: int, bounds: Bounds) -> int:
-    """The step by which literal k has to have held at some step after s; NO_DATE where it may fail for good.
+    """The step by which literal k has to have held at some step after s; NO_DATE if it may fail for ever.
 
-    guess: the step to try first, which saves time where it is right.
+    guess: the step to try first, which saves time if it is right.
     """
     last = literals.literal[k, LAST]
     low, high, tried = s, last + 1, guess if s < guess <= last else last
@@ -151,9 +151,9 @@ def due_date(literals: PackedLiterals, k: int, s: int, guess: int, bounds: Bound
 def needed_until(
     literals: PackedLiterals, k: int, s: int, begin: int, stop: int, goal: int, bounds: Bounds
 ) -> int:
-    """The last step of those from `begin` to stop - 1 at each of which literal k has to hold; begin - 1 for
-    none. goal: -1, or a literal as long as which has not held since step s literal k has to hold, as the left
-    side of an `until` has to.
+    """The last step up to which literal k has to hold at every step from `begin` on, at most stop - 1;
+    begin - 1 if it need not hold at `begin`. goal: -1, or a literal that is supposed to fail from step s + 1
+    on, as the right side of an `until` does while its left side has to hold.
     """
     low, high, tried = begin - 1, min(literals.literal[k, LAST] + 1, stop), begin
     while high - low > 1:
@@ -171,8 +171,8 @@ def needed_until(
 
 @leaf
 def stay_for(literals: PackedLiterals, k: int, s: int, by: int, most: int, bounds: Bounds) -> int:
-    """The fewest steps to stay where literal k holds at step s, so that it is not due at step `by` any more
-    and may fail for a step at least; most + 1 where `most` steps are not enough.
+    """The fewest steps to stay where literal k holds at step s, after which it is no longer due at step `by`
+    and may fail for at least one step; most + 1 if `most` steps are not enough.
     """
     low, high, tried = -1, most + 1, 0
     while high - low > 1:

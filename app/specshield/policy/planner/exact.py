@@ -1,10 +1,10 @@
-"""The way to a literal by search over exact poses, where no descent of a field leads there in time.
+"""The way to a literal by search over exact poses, for when no descent of a field leads there in time.
 
-A field of steps to go is made on a lattice: near a deadline it leads some steps astray, round a corner or
-along what has to be kept out of. Here every pose that the robot's motions can reach is tried, by A* (Hart,
-Nilsson and Raphael 1968): those first whose steps so far and steps to go are the fewest. The fields say how
-many steps there are to go, and cut what is too late by more than they err. Poses that are nearly the same
-count once, the one that is reached in the fewest steps.
+A field of steps to go is made on a lattice: round a corner or along a forbidden place it may lead some steps
+astray, too many near a deadline. Here every pose that the robot's motions can reach is tried, by A* (Hart,
+Nilsson and Raphael, 1968): first those with the least sum of the steps so far and the steps to go. The fields
+give the steps to go; poses that are too late by more than the fields err are left out. Of poses that are
+nearly the same, the one that is reached in the fewest steps counts.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
-NEAR = 3.0  # [steps] from where the field leads: nearer than this, poses are told apart by the finer grain
+NEAR = 3.0  # [steps] from where the field leads: nearer than this, the finer grain applies
 GRAIN, FINE = 0.1, 0.02  # [m] poses that differ by less, and by less than a degree, count once
 GRAINS = (GRAIN, 0.03)  # [m] tried in turn: the coarse one can miss the few poses that lead through a gap
 RICH = 100_000  # poses: with fewer left to try, only the first grain is tried. Chosen by hand
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
-DEEPER = 1e-3  # [steps] by which a pose farther on its way goes before one that is as good
-LEGS = 8  # literals that one way may go to like this, one after the other
+DEEPER = 1e-3  # [steps] the advantage, for each step made, of a pose farther on its way over one as good
+LEGS = 8  # literals that one way may go to by such searches, one after the other
 
 
 @kernel
 def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: int) -> bool:
-    """As `search` from x_t, which has to have failed just before; goes on by it after each leg.
+    """Goes to one literal after the other by searches over exact poses, and after each calls `search` for the
+    rest of the way. To be called right after `search` from x_t has failed; the result is that of `search`.
 
-    most: the poses that the searches for all legs may make.
+    most: how many poses the searches for all legs may make.
     """
     tree, n, left = make_tree(most, 0), 0, most
     for _ in range(LEGS):
@@ -50,8 +51,8 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
             if holds(world, k, way.rho):
                 continue
             stop = int(min(way.motions.shape[0], due[k] - way.t))
-            # A gap beside what has to be kept out of may be too narrow for the lattice, and so for the field
-            # that leads round it, but not for the robot.
+            # A gap beside a forbidden place may be too narrow for the lattice, and so for the field that
+            # keeps out of that place, but not for the robot.
             guarding = guard(world, way, k, n, way.t + stop, nodes.need[0])
             for column in range(1, -1, -1):
                 same = world.field[k, 0] == world.field[k, 1]
@@ -78,9 +79,9 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
 def _reach(
     world: World, way: Way, k: int, f: int, n: int, stop: int, need: Ints, tree: Tree, most: int, grain: float
 ) -> tuple[int, int]:
-    """Goes on from motions[:n] to where literal k holds, by motions[:stop] and by field f, and keeps what has
-    to hold on the way. grain [m]: poses that differ by less count once, but not near the literal. How many
-    motions there are then, -1 where it is not found; how many poses were made.
+    """Goes on from motions[:n] to where literal k holds, guided by field f, and keeps what has to hold on the
+    way. Returns how many motions there are then, -1 if no way within `stop` motions is found; and how many
+    poses were made. grain [m]: poses that differ by less count once; near the literal FINE is used instead.
     """
     body = world.body
     tree.table[:] = -1

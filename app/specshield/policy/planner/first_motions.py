@@ -18,14 +18,14 @@ from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS
 from specshield.stl.program import STACK_SIZE
 
-# Shares of one plan's effort: what a search after a first motion may cost with which the plan does not begin,
-# and what all of these that find nothing may cost where a robot has unusually many motions. Chosen by hand.
+# Shares of one plan's effort: for a search after a first motion other than the plan's, and for all such
+# searches that find nothing if a robot has more than USUAL_MOTIONS. Chosen by hand.
 SHARE, IN_VAIN, USUAL_MOTIONS, GOLDEN = 0.25, 16.0, 7, 0.618
 
 
 @kernel
 def make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
-    """Room for a way of so many steps from x_t, with the signals (S,) at what they are held at."""
+    """Room for a way of so many steps from x_t. signals (S,): the values that they keep."""
     literals, size = world.literals, world.literals.formula.tree.size
     values = np.zeros(REGIONS + literals.formula.regions.plain.shape[0] + signals.shape[0])
     fill_signals(literals.formula.regions, signals, values)
@@ -60,8 +60,8 @@ def make_nodes(literals: int, motions: int) -> Nodes:
 
 @leaf
 def _rejoin(world: World, way: Way, base: Ints) -> bool:
-    """Undoes the first motion and goes by `base` (T - t,), a way from x_t; the steps lost are made up where
-    that stays. Whether the formula is satisfied.
+    """Undoes the first motion and goes by `base` (T - t,), a way from x_t, with fewer waits. Returns whether
+    the formula is satisfied.
     """
     back = undo_motion(world.body, way.poses[0], way.poses[1])
     if back == IMPOSSIBLE:
@@ -87,9 +87,9 @@ def plan_all(
     """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
     takes, and whether there is a plan.
 
-    signals (S,): those held; prefix (size,): the formula's leaves to step t; most: the poses that a search
-    over exact poses may make. One plan is made from x_t, if there is one. The other first motions only have
-    to be undone to go the same way; those for which that comes too late are planned for by themselves.
+    signals (S,): the values that they keep; prefix (size,): the formula's leaves to step t; most: how many
+    poses a search over exact poses may make. First a plan from x_t is looked for. Each other first motion is
+    undone to go the same way. If that comes too late, a plan after that motion is looked for.
     """
     count, steps = motions.shape
     way = make_way(world, t, steps, signals)
@@ -97,7 +97,7 @@ def plan_all(
     base, left, order = -1, np.inf, np.arange(count)
     if count > USUAL_MOTIONS:  # neighbours in the robot's list often fail alike, so others come in between
         left, order = IN_VAIN * effort, np.argsort(order * GOLDEN % 1.0)
-    # First x_t itself (-2); then staying (-1), which others can fall back on; then every other motion.
+    # First x_t itself (-2); then staying (-1), which others can use; then every other motion.
     for root in range(-2, count):
         m = world.pad if root < 0 else order[root]
         if root >= -1 and (m == base or (root >= 0 and m == world.pad)):

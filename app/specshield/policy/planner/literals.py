@@ -30,8 +30,8 @@ class Literal(NamedTuple):
     """A predicate, or its negation where `side` is -1.
 
     guards: whether an `always`, or the left side of an `until`, asks for it, so that it has to hold for a
-    while. ends: where only `until` asks for that, the literals (predicate, side) of the right side, any of
-    which may end the while.
+    while. ends: if nothing but `until` asks for that, the literals (predicate, side) of the right sides, any
+    of which may end the while.
     """
 
     predicate: Formula
@@ -43,11 +43,11 @@ class Literal(NamedTuple):
 class PackedLiterals(NamedTuple):
     """A formula of P predicates and L literals over a task; its tree has l leaves.
 
-    formula: the view of the formula as `separate` leaves it. leaf [l, 2]: the predicate that a leaf is, and
-    -1 where the leaf is its negation, else 1; predicate -1 for a leaf that reads signals alone. predicate [P,
-    2]: one leaf that is the predicate or its negation, and -1 for the negation. literal [L, 4]: the columns
-    PREDICATE; SIDE, -1 for the negation; LAST, the last step at which some leaf reads it; GUARDS, 1 or 0.
-    margin: a literal holds, and the formula is satisfied, where its robustness is above this.
+    formula: the view of the formula that `separate` returns. leaf [l, 2]: the predicate of each leaf, -1 if
+    it reads signals alone; and -1 if the leaf is the predicate's negation, else 1. predicate [P, 2]: one leaf
+    that is the predicate or its negation, and -1 for the negation. literal [L, 4]: the columns PREDICATE;
+    SIDE, -1 for the negation; LAST, the last step at which some leaf reads it; GUARDS, 1 or 0. margin: a
+    literal holds, and the formula is satisfied, if its robustness is above this.
     """
 
     formula: View
@@ -111,8 +111,9 @@ def separate(task: Task, formula: Formula) -> Formula:
 
 
 def released(formula: Formula) -> Formula:
-    """The same formula, of the same robustness, where a conjunct `not (p U[a,b] q)` says that q fails all the
-    while, or to a step at which p fails too. Else q is due to fail at each next step: plans go step by step.
+    """A formula of the same robustness, in which a conjunct `not (p U[a,b] q)` says that q fails throughout,
+    or up to a step at which p fails too. In the first form q is due to fail at the next step at each step, so
+    that plans would go on by single steps.
     """
     said = list(parts := conjuncts(formula))
     for i, part in enumerate(parts):
@@ -125,7 +126,7 @@ def released(formula: Formula) -> Formula:
 
 
 def leading(literal: Literal) -> tuple[Formula, int]:
-    """The predicate and side of a literal's first part, where a field may lead if none leads to the whole."""
+    """The predicate and side of a literal's first part, to which a field may lead if none leads to all."""
     whole = literal.predicate
     return _without_not(whole.children[0] if isinstance(whole, And) else whole)
 
@@ -146,9 +147,9 @@ def _without_not(predicate: Node) -> tuple[Formula, int]:
 def _leaves(
     formula: Formula, positive: bool, ends: Ends | None
 ) -> Iterator[tuple[Formula, bool, Ends | None]]:
-    """The leaves in the order of `compile_tree`, each with its polarity and what may end its while.
-
-    The last is None for a leaf that need not hold for a while, and empty where nothing but time ends that.
+    """The leaves in the order of `compile_tree`, each with its polarity and with the literals that may end
+    the while for which it has to hold. These are None if it need not hold for a while, and empty if nothing
+    but time ends that.
     """
     match formula:
         case _ if is_predicate(formula):

@@ -54,7 +54,7 @@ from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
 from specshield.task import Task
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
-MAX_FIELDS = 32  # further literals have no field, and no plan goes to where they hold
+MAX_FIELDS = 32  # further literals have no field, so no plan goes to where they hold
 USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effort of the settings
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
@@ -68,9 +68,10 @@ FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 class PlannerPolicy(Carded):
     """Plans at every decision.
 
-    chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
-    to hold for a while; -1 for none. foreseen [S]: what the signals hold from x_{t+1} on; None: their last
-    values. share: of the effort that the settings allow. rest: what is planned for where parts are given up.
+    chosen [L, 2]: for each literal of the formula the field that leads to it freely, and the one that keeps
+    what has to hold for a while; -1 for none. foreseen [S]: the values of the signals from x_{t+1} on; None:
+    their last values. share: of the effort that the settings allow. rest: the formula that is planned for if
+    parts are given up.
     """
 
     settings: Settings
@@ -85,15 +86,15 @@ class PlannerPolicy(Carded):
         return self._world_of(self.task.formula)
 
     def on_body(self, body: Body, guess: bool = False) -> PlannerPolicy:
-        """The policy on another map: its fields lead as they did, its ways are those that there are."""
+        """The policy on another map: its fields stay the same, its ways are simulated on that map."""
         return replace(self, share=GUESSED if guess else 1.0)._in(self._world._replace(body=body))
 
     def briefly(self) -> PlannerPolicy:
-        """The policy with less effort a plan, for an explanation, which asks for many ways and goes none."""
+        """The policy with less effort a plan, for explanations, which ask it often."""
         return self.on_body(self._world.body, guess=True)
 
     def avoiding(self, barred: Floats) -> PlannerPolicy:
-        """The policy for a robot that some motions led nowhere (robot/barred.py)."""
+        """The policy without barred motions [n, 6] (robot/barred.py)."""
         return self._in(self._world._replace(barred=barred))
 
     def giving_up(self, lost: tuple[Formula, ...]) -> PlannerPolicy:
@@ -102,7 +103,7 @@ class PlannerPolicy(Carded):
         return replace(self, share=GUESSED, rest=all_of(rest))._in(self._world)
 
     def foreseeing(self, signals: Floats) -> PlannerPolicy:
-        """The policy that takes the signals to hold these values [S] from x_{t+1} on, whatever they hold."""
+        """The policy that takes the signals to have these values [S] from x_{t+1} on."""
         return replace(self, foreseen=signals)._in(self._world)
 
     def _in(self, world: World) -> PlannerPolicy:
@@ -117,14 +118,14 @@ class PlannerPolicy(Carded):
         known = {each[:2]: (*of,) for each, of in zip(all_literals, self.chosen.tolist(), strict=True)}
         leads = [known.get(each[:2], known.get(leading(each), (-1, -1))) for each in literals]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
-        # Without a turn in place the lattice has few of the ways that there are: its fields rule out nothing.
+        # For a robot that cannot turn in place the lattice misses many ways, so its fields rule out nothing.
         band = BAND if turning_motion(self._body) >= 0 else 2.0 * OUT_OF_REACH
         columns, cost = np.array(leads, np.int64).reshape(-1, 2), cost_of(packed.formula.tree)
         return World(self._body, self.fields, packed, columns, band, pad, stands, cost, NOTHING_BARRED)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        """A plan from x_t, and one after each other first motion. Where there is none without barred motions,
-        it looks for one with them, unless the decision has other maps to try.
+        """A plan from x_t, and one after each other first motion. If there is none without barred motions,
+        one with them is looked for, unless the decision has other maps to try.
         """
         ways, found = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
         if self.rest is not None:
@@ -159,8 +160,9 @@ class PlannerPolicy(Carded):
         return joined(*(proposal for proposal, _ in plans)), found
 
     def _asked(self, formula: Formula, history: Floats, rows: Floats, margin: float) -> tuple[Formula, ...]:
-        """What J asks the margin of: each part as a whole where it can have it there, else what is still
-        open; where a visit that is behind has less, also what is still open of all parts.
+        """The formulas of which J asks the margin. J asks it of each part as a whole if that can still have
+        it, else of what is still open of the part. If a past visit has less than the margin, there is a
+        second formula: what is still open of all parts.
         """
         parts = conjuncts(formula)
         bounds = [bounds_after(self.task, part, history, rows) for part in parts]
@@ -199,7 +201,7 @@ class PlannerPolicy(Carded):
         signals: Mapping[str, Floats] | None = None,
         on_progress: Callable[[float], None] = lambda done: None,
     ) -> float:
-        """The share of poses drawn from the lattice (the same each time) that some plan begins at.
+        """The share of poses drawn from the lattice (the same each time) from which a plan was found.
 
         signals {name: [1]}: held from x_0 on; else each has its initial value. on_progress: told the share
         of the poses that were tried.
@@ -298,7 +300,7 @@ def _pitch(task: Task, settings: Settings) -> float:
 
 def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tuple[Bools, Bools]:
     """Where each literal holds, [L, ny, nx, H], with the signals at their initial values; and the same with
-    what the lattice does not see (reachability/sight.py): about narrow places, where it may hold close by.
+    the poses near to narrow places, which the lattice does not see (reachability/sight.py).
     """
     known, body = places(task), make_body(task.robot, task.grid)
     programs = compile_predicates([each.predicate for each in literals], known)
@@ -311,9 +313,8 @@ def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tup
 
 
 def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
-    """The literals that every way to a goal has to keep, and those that some have to, for a while.
-
-    The first have to hold, whatever else happens, at half of all steps or more.
+    """The literals that a way to a goal has to keep: in any case, and those beside them that may have to hold
+    for a while. The former have to hold, whatever else happens, at half of all steps or more.
     """
     size = packed.formula.tree.size
     bounds = make_bounds(size)

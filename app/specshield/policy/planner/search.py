@@ -1,10 +1,10 @@
 """The search for a way that satisfies a formula: go to where a literal holds, stay, go on.
 
 A node of the search is a simulated prefix. Each child serves one literal: it goes to where the literal holds
-and stays until it is not due any more. The literal that is due first comes first. A robot that cannot stay
-moves about near there, and the last children of its nodes are its single motions. A child that no
-continuation can save, because the upper bound on rho is not above the margin, is cut. A node from which
-staying to the horizon satisfies the formula ends the search.
+and stays until the literal is no longer due. The literal that is due first comes first. A robot that cannot
+stay moves about near there, and the last children of its nodes are its single motions. A child is cut if its
+upper bound on rho is not above the margin. A node from which staying to the horizon satisfies the formula
+ends the search.
 
 The order of the children is nearly always right, so the search first tries the ways that depart least from it
 (limited discrepancy search, Harvey and Ginsberg 1995). Its effort is counted, not timed: the same question
@@ -74,13 +74,13 @@ def value(world: World, way: Way) -> float:
 
 @leaf
 def _foresee(world: World, way: Way, n: int) -> None:
-    """The leaves' bounds after motions[:n], into way.bounds."""
+    """Writes the leaves' bounds after motions[:n] into way.bounds."""
     foresee(world.literals, way.t + n, way.known, way.held, way.bounds)
 
 
 @leaf
 def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, keep: int) -> None:
-    """Adds a child to the node at depth d, in its place among those not tried yet."""
+    """Adds a child to the node at depth d, in the order of KEY among those not tried yet."""
     i, child = nodes.state[d, COUNT], nodes.child
     if i == child.shape[1]:
         return
@@ -95,8 +95,8 @@ def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, 
 
 @leaf
 def guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool:
-    """Notes what has to hold from motions[:n] on, at most to step `stop`, until literal k does. Whether
-    anything has to hold for a while.
+    """Writes into need (L, 4) what has to hold from motions[:n] on, at most to step `stop`, until literal k
+    does. Returns whether anything has to hold for a while.
     """
     literals, guarding, s = world.literals, False, way.t + n
     _foresee(world, way, n)
@@ -114,7 +114,7 @@ def guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool
 
 @inlined
 def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> bool:
-    """Makes the node at depth d, of motions[:n]. Whether staying here satisfies the formula."""
+    """Makes the node at depth d, of motions[:n]. Returns whether staying here satisfies the formula."""
     literals, steps, s, need = world.literals, way.motions.shape[0], way.t + n, nodes.need[d]
     state = nodes.state[d]
     state[MADE], state[USED], state[COUNT], state[TRIED], state[OPENED] = n, used, 0, 0, 0
@@ -171,7 +171,7 @@ def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> 
 
 @inlined
 def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
-    """Makes child c of the node at depth d: how many motions there are then, -1 where it leads nowhere."""
+    """Makes child c of the node at depth d. Returns how many motions there are then, -1 if it is cut."""
     literals, steps, need = world.literals, way.motions.shape[0], nodes.need[d]
     made, child = nodes.state[d, MADE], nodes.child[d, c]
     k, before, stays, keep = child[LITERAL], child[BEFORE], child[STAY], child[KEEP]
@@ -214,7 +214,7 @@ def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
             stays = stay_for(literals, k, way.t + n, by, steps - n, way.bounds)
             way.spent[0] += 8.0 * world.cost
             if 0 < stays <= steps - n:
-                if before == 0:  # or wait first and go there when it counts, or go on before it is served
+                if before == 0:  # other ways: to wait first and go there when it counts, or not to stay
                     _add(nodes, d, STAYING + by, k, stays if world.stands else n - made + stays, 1, -1)
                     _add(nodes, d, LATER + by, k, 0, 0, -1)
                 linger(world, way, k, n, n + stays, need)
@@ -226,9 +226,8 @@ def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
 
 @leaf
 def search(world: World, way: Way, nodes: Nodes, n: int, effort: float) -> bool:
-    """Writes a way to the horizon that satisfies the formula, on from motions[:n]; whether there is one.
-
-    way.known has to hold the leaves to step t + n. effort [about us].
+    """Goes on from motions[:n] to the horizon so that the formula is satisfied; returns whether that is
+    found. way.known has to hold the leaves to step t + n. effort [about us].
     """
     state, most = nodes.state, way.spent[0] + effort
     limit, cut = 0, True  # how many discrepancies are allowed, and whether ways with more were left out

@@ -15,19 +15,19 @@ from specshield.policy.planner.literals import PREDICATE, SIDE, PackedLiterals
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, step
 
-# What is needed of a literal, the columns of `need`: the step by which it has to hold once; from which step
-# until which it has to hold throughout; and until which step it has to as long as the literal that the robot
-# goes to does not hold.
+# The columns of `need`, for each literal: DUE, the step by which it has to hold once; BEGIN and UNTIL, the
+# steps between which it has to hold throughout; UNTIL_GOAL, the step to which it has to hold as long as the
+# literal that the robot goes to does not.
 DUE, BEGIN, UNTIL, UNTIL_GOAL = range(4)
 
 
 class World(NamedTuple):
     """What a search reads.
 
-    field [L, 2]: the field that leads to each literal freely, and the one that keeps to what has to hold for
-    a while; -1 for none. band: how far the fields may err [steps]. pad: the motion that stays, or comes
-    nearest to it; stands: whether it stays. cost: of one evaluation of the formula [about us]. barred [n, 6]:
-    motions that are taken to lead nowhere (robot/barred.py).
+    field [L, 2]: the field that leads to each literal freely, and the one that keeps what has to hold for a
+    while; -1 for none. band: how far the fields may err [steps]. pad: the motion that stays, or comes nearest
+    to it; stands: whether it stays. cost: of one evaluation of the formula [about us]. barred [n, 6]: motions
+    that are taken to lead nowhere (robot/barred.py).
     """
 
     body: Body
@@ -86,7 +86,7 @@ def keeps(world: World, goal: int, at: int, need: Ints, rho: Floats) -> bool:
 
 @leaf
 def read_at(world: World, way: Way, n: int) -> None:
-    """The predicates at poses[n], into way.rho."""
+    """Writes the predicates at poses[n] into way.rho."""
     x, y, theta = way.poses[n, 0], way.poses[n, 1], way.poses[n, 2]
     read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
 
