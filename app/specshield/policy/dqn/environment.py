@@ -87,8 +87,8 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> F
     """
     xmin, ymin, xmax, ymax = task.grid.bounds
     kept = np.empty((0, 3))
-    # No point of a cell is farther from an obstacle than its middle's clearance plus a cell, so a wider robot
-    # fits nowhere. To find that by drawing takes 20 s for a radius of 5 m.
+    # No point of a cell is farther from an obstacle than the clearance of its centre plus a cell, so a robot
+    # with a larger radius fits nowhere. To find that by drawing takes 20 s for a radius of 5 m.
     fits = body.clearance.max() + body.resolution > body.radius
     for _ in range(1000 if fits else 0):
         draw = random.random((2 * n + 64, 3))
@@ -110,11 +110,11 @@ def _are_free(body: Body, poses: Floats) -> Bools:
 
 @kernel
 def begin_episode(rules: Rules, t: int, chance: Floats, state: State) -> None:
-    """Gives the robot at x_t progress that it could have: what is due before t is settled, what may be is by
-    chance, and x_t itself counts.
+    """Gives the robot at x_t progress that it could have: obligations that are due before t are settled,
+    those whose window is open are settled by chance, and x_t itself counts.
 
-    chance (K,): uniform in [0, 1). A window that has been open for a while is the likelier to be settled, the
-    more of it is over, and at least as likely as not.
+    chance (K,): uniform in [0, 1). The more of a window is over, the likelier it is settled; the probability
+    is at least 0.5.
     """
     status = state.status
     for k in range(rules.kind.shape[0]):

@@ -5,11 +5,11 @@
 
 There are two rewards for a conjunction of obligations.
 
-`paper` is eq. 5 with Table I to the letter: t is the episode's own step, robustness the formula's own. What
-the paper leaves open is chosen so. gamma_inf is REST of its upper limit. t* of F is the middle of its window,
-that of F G the middle of Table I's interval. Where t* would be 0, as for G[0,b], it is 1, the first step that
-there is. Of several obligations the least r counts, over those whose window holds t; 0 where none does. An
-episode ends at the horizon, or where an obligation is broken.
+`paper` is eq. 5 with Table I to the letter: t is the episode's step, robustness that of the formula. The
+paper leaves some things open, which are chosen as follows. gamma_inf is REST of its upper limit. t* of F is
+the middle of its window, that of F G the middle of Table I's interval. A t* of 0, as for G[0,b], is replaced
+by 1, the first step that there is. r is the least over all obligations whose window holds t, 0 if there are
+none. An episode ends at the horizon, or when an obligation is broken.
 
 `progress`, the default, is ours: it counts the goals that are settled, adds the current goal's funnel along
 free space, whose clock starts with the goal's window, and takes the minimum with the robustness of each

@@ -152,8 +152,8 @@ def observe(scene: Scene, t: int, state: State) -> None:
 def _observe_motions(
     scene: Scene, t: int, state: State, at: int, target: int, here: float, guarded: bool
 ) -> None:
-    """Of each motion: whether it is made in full, how much nearer it brings the goal, how safe it leaves the
-    robot.
+    """Writes three entries for each motion: whether it is made in full, how much nearer it brings the goal,
+    and how safe the robot is after it.
     """
     body, rules, out = scene.body, scene.rules, state.observation
     x, y, theta = state.pose[0], state.pose[1], state.pose[2]

@@ -45,7 +45,7 @@ class Policy(Carded):
         return make_scene(self.task)
 
     def on_body(self, body: Body, guess: bool = False) -> Policy:
-        """The policy on another map: it sees the distances that it saw, its ways are those that there are."""
+        """The policy on another map: the distances it sees stay the same, its ways are simulated there."""
         other = replace(self)
         other.__dict__["scene"] = self.scene._replace(body=body)
         return other

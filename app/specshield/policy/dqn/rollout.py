@@ -86,10 +86,10 @@ def _retrace(scene: Scene, t: int, state: State, motions: Ints, poses: Floats) -
 def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: bool, motions: Ints) -> int:
     """Writes a continuation for each first motion into motions (M, T - t).
 
-    Returns the motion that pi_phi itself takes. Where `literal`, every row is pi_phi's own rollout after that
-    motion. Otherwise, as soon as one row settles everything, it is tried to join that row after another first
-    motion: from the same place (policy/detour.py) or by undoing the motion. Where neither settles everything,
-    that row is pi_phi's own rollout as well.
+    Returns the motion that pi_phi itself takes. If `literal`, every row is pi_phi's own rollout after that
+    motion. Otherwise, once some row settles everything, other first motions try to join it: from the same
+    place (policy/detour.py) or by undoing the motion. If neither settles everything, the row is pi_phi's own
+    rollout as well.
 
     undoing (M, 2): the motions that undo each, -1 for none.
     """
