@@ -1,9 +1,9 @@
 """Whether it can be shown that no future satisfies the formula, whatever the robot does.
 
-Two things are joined. The first steps are followed exactly: every pose that some list of motions leads to.
-From there on the robot is given more than it can do: it turns at no cost, its way is as short as the floor
-allows (ground.py), and it has only to be somewhere in the places that the formula needs (needs.py), in some
-order. Where not even that can be in time, there is no future; else nothing is known.
+The first steps are followed exactly: every pose that some list of motions leads to. From there on the robot
+is given more freedom than it has: it turns at no cost, its way is as short as the floor allows (ground.py),
+and it only has to visit the places that the formula needs (needs.py), in any order. If not even that can be
+in time, there is no future; else nothing is known.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from specshield.stl.formula import Node
 from specshield.task import Task
 
 # Chosen by hand: what is looked at stays within a second.
-MOST_POSES = 10_000  # that one more of the first steps leads to
+MOST_POSES = 10_000  # at one of the first steps
 MOST_STEPS = 12  # that are followed exactly
 MOST_GOALS = 6  # whose order is looked at
-EDGE = 1e-6  # [m] a point this near an edge is on both sides of it
-SAME = 1e7  # poses that agree when multiplied by this are one
+EDGE = 1e-6  # [m] a point this near to an edge counts as on both sides of it
+SAME = 1e7  # poses that are equal after multiplying by this and rounding are one
 
 
 def proof(task: Task, body: Body, history: Floats, signals: Mapping[str, Floats]) -> str | None:
@@ -54,8 +54,8 @@ def proof(task: Task, body: Body, history: Floats, signals: Mapping[str, Floats]
 
 
 def contradiction(task: Task, body: Body) -> str | None:
-    """Why no start satisfies the formula while the signals hold their initial values, None where that is
-    open. Looked for are needs that hold nowhere, not what is too far.
+    """Why no start satisfies the formula while the signals have their initial values; None if that is not
+    shown. Only needs that hold nowhere are looked for, not places that are too far away.
     """
     known = Known(task, np.empty((0, 3)), {})
     ground, said = make_ground(task, body, known.held), list[str]()
@@ -68,8 +68,8 @@ def contradiction(task: Task, body: Body) -> str | None:
 
 
 def idle(task: Task, body: Body) -> Iterator[str]:
-    """What to say of each part of the formula that holds wherever the robot fits, and so asks for nothing:
-    it may be a place to keep out of that is off the map, or an angle in degrees.
+    """A warning about each part of the formula that holds wherever the robot fits, and so asks for nothing.
+    It may be about a forbidden place that is off the map, or have an angle in degrees.
     """
     ground, nodes = make_ground(task, body, {}), list[Node]([positive(task.formula)])
     for node in nodes:
@@ -81,8 +81,8 @@ def idle(task: Task, body: Body) -> Iterator[str]:
 
 
 def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) -> str | None:
-    """Why these needs cannot all be met, None where that is open. Where one of them cannot be met even by
-    itself, that is what is said, and no other is named beside it.
+    """Why these needs cannot all be met; None if that is not shown. If one of them cannot be met even by
+    itself, only that one is named.
     """
     asked = course(needs, known, ground)
     if isinstance(asked, str):
@@ -100,7 +100,7 @@ class _Ahead(NamedTuple):
     goals: Sequence[Goal]
 
     def refuted(self) -> tuple[str | None, list[Need]]:
-        """Why the needs cannot all be met, and those of them that this may be due to."""
+        """Why the needs cannot all be met, and the needs that may be the cause."""
         now, poses, met = self.known.now, self.known.history[-1:], np.zeros(1, np.int64)
         step, limiting, soonest = now, list[Need](), [math.inf] * len(self.goals)
         while step < now + MOST_STEPS and len(poses) * motion_count(self.body) <= MOST_POSES:
@@ -117,8 +117,8 @@ class _Ahead(NamedTuple):
         self, poses: Floats, met: Ints, step: int, limiting: list[Need], soonest: list[float]
     ) -> tuple[Floats, Ints]:
         """The poses that one more motion leads to and that keep the guards at that step, each with the goals
-        that were met on the way, one bit a goal. Added to `limiting`: guards that some pose breaks; to
-        `soonest` [goals]: the first step at which each goal's place is reached, in its window or not.
+        that were met on the way, one bit a goal. Adds the guards that some pose breaks to `limiting`, and to
+        `soonest` [goals] the first step at which each goal's place is reached, in its window or not.
         """
         further, also = spread(self.body, poses), np.repeat(met, motion_count(self.body))
         alike = np.column_stack([further[:, :2], np.cos(further[:, 2]), np.sin(further[:, 2])])
@@ -144,7 +144,7 @@ class _Ahead(NamedTuple):
     def _too_late(
         self, poses: Floats, met: Ints, step: int, soonest: Sequence[float]
     ) -> tuple[str | None, list[Need]]:
-        """Why from none of these poses all goals can be met in time, as `refuted` has it."""
+        """The result of `refuted`: why from none of these poses all goals can be met in time."""
         # apart: the fewest steps from a place where one goal is met to one where the other is
         apart = [[self._steps(float(b.far[a.where].min())) for b in self.goals] for a in self.goals]
         steps = np.column_stack(

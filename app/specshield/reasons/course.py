@@ -14,7 +14,7 @@ from specshield.reasons.known import Known
 from specshield.reasons.needs import Need
 from specshield.stl import SATISFIED_ABOVE, And, Formula
 
-MOST_NEEDS = 24  # that are looked at; each is held against the others
+MOST_NEEDS = 24  # that are looked at; each is compared with all others
 
 
 class Goal(NamedTuple):
@@ -26,8 +26,8 @@ class Goal(NamedTuple):
 
 
 class Course(NamedTuple):
-    """guards: the needs that have to hold at every step of a window. goals: the needs that some way has to
-    lead to, the smallest places first; a guard whose window is still to come is one of them.
+    """guards: the needs that have to hold at every step of a window. goals: the needs that a way has to lead
+    to, the smallest places first; they include guards whose window is still to come.
     """
 
     guards: tuple[Need, ...]
@@ -36,8 +36,8 @@ class Course(NamedTuple):
 
 def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -> Course | str:
     """What these needs leave to be done, or why they cannot all be met. late: how many steps later than the
-    formula has it they may be met; ways are then measured through nothing but squares that keep the guards,
-    which guides a search better and bounds nothing.
+    formula says they may be met. If that is not 0, distances are measured only through squares that keep the
+    guards: this guides a search better, but is no bound.
     """
     pending: list[Need] = []
     for need in needs[:MOST_NEEDS]:
@@ -63,7 +63,7 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
 
 
 def _turns(predicate: Formula, known: Known) -> bool:
-    """Whether it may depend on the heading, of which a square says nothing."""
+    """Whether a predicate may depend on the heading, of which a square says nothing."""
     areas = known.task.areas
     carried = any(areas[name].point != (0.0, 0.0) for name in predicate.names if name in areas)
     return carried or "theta" in predicate.names
@@ -76,7 +76,9 @@ def possible(predicate: Formula, ground: Ground) -> Bools:
 
 
 def _left(need: Need, past: Bools, now: int) -> Need | bool:
-    """What is still to come of a need that has begun; True: it is, or may be, met; False: it is broken."""
+    """What is left of a need that has begun; True if it is met, or may be; False if it is broken. past: at
+    which steps its predicate held.
+    """
     later, part = max(need.first, now + 1), need.formula
     if need.first == need.last:
         if not past[need.first : need.end + 1].all():
@@ -96,8 +98,9 @@ def _together(need: Need, guards: Sequence[Need], until: int) -> Formula:
 
 
 def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground, late: int) -> Floats:
-    """The ways to a goal keep every guard that holds from the next step until the goal is reached. Unless it
-    may be late, they may lead through squares near those that keep it: between two steps nothing is asked.
+    """How far [m] each square is from the goal at least. Ways keep every guard that holds from the next step
+    until the goal is reached. Unless the goal may be late, they may also lead through squares close by, since
+    a guard says nothing of the way between two steps.
     """
     free, reach = ground.free, 0.0 if late else ground.travel
     for guard in guards:

@@ -1,12 +1,12 @@
 """Why an action is forbidden: the conjunct that fails, by how much, and how many steps too late.
 
-An action is forbidden where no future was proposed that keeps all conjuncts. Of its futures, those that keep
-all conjuncts but one say which one that is. Where that conjunct would be kept if its window ended later, the
-fewest such steps are given. Futures that come too late are not proposed as such, so some are made here: from
-where the action leads, back onto a witness of another action; and what the proposers would do if the clock
-stood some steps earlier. Where one of all these keeps the rule after all, that is what is said.
+An action is forbidden if no future was proposed that keeps all conjuncts. Those of its futures that keep all
+conjuncts but one show which one fails. If that conjunct would be kept if its window ended later, the fewest
+such steps are given. Proposers do not propose futures that come too late, so some are made here: from where
+the action leads, back onto a witness of another action; and what the proposers would do if the clock stood
+some steps earlier. If one of all these keeps the rule after all, the explanation says so.
 
-Nothing here decides anything: what an action's J is has been settled before.
+Nothing here decides anything: J has been settled before.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from specshield.shield.judgement import Judged
 from specshield.shield.proposal import adapted, ask
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
-# Chosen by hand. The last three bound a robot of many motions; the seven of a Stretch never come to more.
+# Chosen by hand. The last three are bounds for robots of many motions; a Stretch with seven stays below them.
 DEPTH = 2  # motions after which a witness is met again
 EARLIER = (1, 2, 4, 8, 16, 32)  # steps by which the proposers' clock is put back
-ASKED, WITNESSES, MET = 42, 7, 49  # how often it is, in a decision; witnesses to meet; places to do so from
+ASKED, WITNESSES, MET = 42, 7, 49  # times that it is, in a decision; witnesses to meet; poses to do so from
 SAME = 1e-6  # [m] and [rad]: poses this near are one pose
 
 Rank = tuple[int, float]
@@ -44,9 +44,8 @@ def explanations(
 ) -> tuple[Explanation | None, ...]:
     """One an action: None where it is allowed, or terminal.
 
-    prefix: as the whole formula sees it. judged: None where the rule forbids nothing any more. doubtful [M]:
-    motions by which the robot was stopped before, that lead where it has run into something, or that only an
-    obstacle would keep out of a forbidden place.
+    prefix: for the whole formula. judged: None if the rule forbids nothing any more. doubtful [M]: the
+    motions that had better not be drawn (`doubtful` in shield/taught.py).
     """
     robot = shield.task.robot
     if judged is None or not prefix.formula.names:
@@ -71,15 +70,15 @@ class _Motion:
     most: int
 
     def explained(self) -> Explanation:
-        """By its most telling future: one that keeps all conjuncts, best with less to spare than J asks for;
-        else all but one, the least late or else the most robust; else the one that comes nearest to keeping
-        all, and the conjunct that it keeps least.
+        """The explanation by the most telling future: one that keeps all conjuncts, best with less to spare
+        than J asks for; else one that keeps all but one, the least late or else the most robust; else the one
+        that comes nearest to keeping all, with the conjunct that it keeps least.
         """
         parts = self.parts()
         best, rank = Explanation(str(parts[0]), -math.inf, None), (NOTHING, math.inf)
         for earlier, rows in self.futures():
             if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
-                break  # what comes now is as late or later
+                break  # all further futures are as late or later
             poses = driven(self.shield, self.prefix.poses, rows)
             samples = self.shield.task.samples(poses, self.prefix.foreseen)
             rho = np.array([values_of(part, samples) for part in parts])  # [parts, rows]
@@ -99,8 +98,9 @@ class _Motion:
         return [*kept, *again(broken, prefix.t + 1)] or [prefix.formula]
 
     def asked(self, parts: Sequence[Formula], rho: Floats, poses: Floats) -> Floats:
-        """What J is the least of: rho [parts, n] of the conjuncts, or of what is asked in place of those that
-        are open, where margin or slack is asked for. poses [n, t + 1 + m, 3]: of the futures.
+        """The values [parts, n] of which J takes the least: rho of the conjuncts or, if margin or slack is
+        asked for, for an open conjunct rho of what is asked in its place. poses [n, t + 1 + m, 3]: of the
+        futures.
         """
         part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
         if len(early):  # else J is made of the conjuncts as a whole
@@ -118,8 +118,8 @@ class _Motion:
     def shows(
         self, parts: Sequence[Formula], rho: Floats, asked: Floats, row: dict[str, Floats]
     ) -> tuple[Rank, Explanation]:
-        """What a future shows, and how telling that is. rho, asked [parts]: of the conjuncts, and what J is
-        made of; row {name: [m]}: what the formula reads along it.
+        """How telling a future is, and what it shows. rho [parts]: of the conjuncts; asked [parts]: see
+        `asked`; row {name: [m]}: what the formula reads along the future.
         """
         failing = np.flatnonzero(rho <= SATISFIED_ABOVE)
         if not len(failing):
@@ -158,8 +158,8 @@ class _Motion:
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
 
     def lacks(self, part: Formula, row: dict[str, Floats]) -> tuple[int | None, str]:
-        """Of a conjunct that is kept along `row`, but not as J asks: how many steps late it is for that, None
-        where steps are no measure of it; and what is lacking, in words.
+        """For a conjunct that is kept along `row`, but not with the margin or the slack that J asks for: how
+        many steps too late it is for that, None if time is not what it lacks; and what it lacks, in words.
         """
         parts, early = conjuncts(self.judged.part.formula), self.judged.aimed.early.tolist()
         reserve = dict(zip(parts, early, strict=False)).get(part, 0)
@@ -174,7 +174,7 @@ class _Motion:
         return None, self.known(part, reserve)
 
     def known(self, part: Formula, reserve: int) -> str:
-        """Why a motion is forbidden though a known future keeps the rule. reserve [steps]: as in `lacks`."""
+        """Why the motion is forbidden though a known future keeps the rule. reserve: the slack asked for."""
         if self.doubtful:
             return (
                 "the rule could still be kept, but only by what led nowhere before, or by an obstacle that "
@@ -195,8 +195,8 @@ class _Motion:
         )
 
     def futures(self) -> Iterator[tuple[int, Ints]]:
-        """Motions [n, m] from x_t that begin with this one, to the horizon or to some steps after it; and of
-        how many steps at least what they keep would come too late.
+        """Motions [n, m] from x_t that begin with this one and go on to the horizon or beyond; with each, by
+        how many steps at least it comes too late.
         """
         shield, prefix, tried = self.shield, self.prefix, self.judged.tried
         own = tried.motions[tried.motions[:, 0] == self.motion]
@@ -219,7 +219,7 @@ class _Motion:
             before = earlier
 
     def rejoined(self, x_next: Floats) -> dict[int, list[Ints]]:
-        """Goes on by another action's witness from where that is met again: ways by the steps they lose."""
+        """Ways that go on by another action's witness from where it is met again, by the steps they lose."""
         shield, tried, x_t = self.shield, self.judged.tried, self.prefix.poses[-1:]
         rows = self.judged.aimed.best.row[self.judged.feasible_motion][:WITNESSES]
         ways = [(tried.motions[row], np.concatenate([x_t, tried.poses[row]])) for row in rows]

@@ -1,9 +1,9 @@
-"""The floor as squares: where the footprint's centre may be, how long the ways between are at least, and how
-high a predicate can be there.
+"""The floor as squares: where the footprint's centre may be, how long the ways between squares are at least,
+and how high a predicate can be in a square.
 
-All of it errs on the side of more: a square counts as free where some point of it is, ways are never measured
-longer than they are, and a predicate counts as possible where interval arithmetic does not rule it out. So
-what is impossible here is impossible for the robot.
+All of it errs on the side of more: a square counts as free if some point of it is, ways are never measured
+longer than they are, and a predicate counts as possible if interval arithmetic does not rule it out. So what
+is impossible here is impossible for the robot.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from specshield.world.regions import area_distance, pack_areas
 
 # Chosen by hand: the ways to one goal, and one region, take 0.1 s at most.
 MOST_SQUARES = 150_000  # a larger map has larger squares
-MOST_WORK = 50_000_000  # squares times the numbers that describe the regions: as well
-SPARE = 2e-3  # [m] that a footprint counts as smaller: above what f allows it to overlap in its turns
-LONGER = 1.0 / math.cos(math.atan(0.5) / 2.0)  # than the shortest are ways along 16 directions: by 2.8 %
+MOST_WORK = 50_000_000  # squares times the numbers that describe the regions; beyond that they are larger too
+SPARE = 2e-3  # [m] by which the footprint counts as smaller: more than f allows it to overlap in its turns
+LONGER = 1.0 / math.cos(math.atan(0.5) / 2.0)  # ways along 16 directions are at most 2.8 % too long
 Interval = tuple[Floats, Floats]
 
 
@@ -109,7 +109,7 @@ class Ground:
 
 
 def make_ground(task: Task, body: Body, values: dict[str, float]) -> Ground:
-    """body: on the map as it is known by now. values: what the signals are held at."""
+    """The floor of the body's map. values: what the signals are held at."""
     grid = task.grid
     room = body.clearance + grid.resolution * math.sqrt(0.5) >= task.robot.radius - SPARE
     numbers = pack_areas(list(task.areas.values())).data.size
@@ -129,12 +129,12 @@ def make_ground(task: Task, body: Body, values: dict[str, float]) -> Ground:
 
 @kernel
 def _ways(goal: Bools, free: Bools) -> Floats:
-    """The shortest way from any corner of each square to one of a goal, by moves of one square along an
-    edge or a diagonal, and of two squares ahead and one aside.
+    """The shortest way [squares] from any corner of each square to a corner of a goal, by moves of one square
+    along an edge or a diagonal, and of two squares ahead and one aside.
 
-    A shortest way through the floor bends at corners of squares alone, and each straight part of it, from
-    corner to corner, has such moves through the very squares that it crosses, at most LONGER times as long:
-    two columns, in the second of which it rises, are one move of the last kind.
+    A shortest way through the floor bends only at corners of squares. Each straight part of it, from corner
+    to corner, can be replaced by such moves through the squares that it crosses, which are at most LONGER
+    times as long: where it rises by one row in two columns, that is one move of the last kind.
     """
     ny, nx = free.shape
     far = np.full((ny + 1, nx + 1), np.inf)

@@ -1,4 +1,4 @@
-"""What has been driven, what the signals hold, and where predicates hold by that."""
+"""What has been driven, what the signals are taken to hold, and where predicates then hold."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from specshield.errors import SampleError
 from specshield.stl import Formula, robustness
 from specshield.task import Task
 
-ROUNDING = 1e-9  # robustness above minus this counts as positive: f's own code may round otherwise
+ROUNDING = 1e-9  # robustness above minus this counts as positive, since compiled code may round otherwise
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Known:
         return {name: float(self.task.signal(name, self.signals, steps)[-1]) for name in self.task.signals}
 
     def constant(self, predicate: Formula, step: int) -> bool | None:
-        """As `needs.Reader` has it."""
+        """See `needs.Reader`."""
         if not predicate.names or not set(predicate.names) <= set(self.task.signals):
             return None
         held = bool(self.at(predicate, np.zeros((1, 3)))[0])

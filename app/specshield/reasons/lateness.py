@@ -1,6 +1,4 @@
-"""How a future stands to one conjunct: its robustness, how late it comes, and in words which half of it fails
-and when.
-"""
+"""What a future says of one conjunct: its robustness, how late it comes, and in words what fails and when."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from specshield.stl.conjunction import is_predicate
 
 
 def driven(shield: Shield, history: Floats, motions: Ints) -> Floats:
-    """The poses [n, t + 1 + m, 3] of x_0..x_t and of each row of motions [n, m]."""
+    """The poses [n, t + 1 + m, 3]: x_0..x_t, then where each row of motions [n, m] leads."""
     poses = np.empty((len(motions), len(history) + motions.shape[1], 3))
     poses[:, : len(history)] = history
     for row, joined in zip(motions, poses, strict=True):
@@ -27,7 +25,7 @@ def driven(shield: Shield, history: Floats, motions: Ints) -> Floats:
 
 
 def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
-    """rho along each trajectory, -inf on all where the formula's arithmetic is not finite on one of them."""
+    """rho along each trajectory; -inf on all if the formula's arithmetic is not finite on one of them."""
     some = next(iter(samples.values()))
     try:
         return np.broadcast_to(robustness(formula, {n: samples[n] for n in formula.names}), some.shape[:-1])
@@ -36,9 +34,9 @@ def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
 
 
 def late_by(part: Formula, samples: Mapping[str, Floats], now: int) -> int | None:
-    """The fewest steps later that the window of an F or U would have to end for it to be satisfied, or that
-    of a G over a place to be in to begin; None where no later one that the samples [m] reach would do, or the
-    G has begun by step `now`.
+    """By how many steps, at least, the window of an F or U would have to end later for the conjunct to be
+    satisfied, or that of a G over a predicate would have to begin later. None if nothing that the samples [m]
+    reach is enough, or the G has begun by step `now`.
     """
     if later(part, 1) is None or not may_be_late(part, samples, now):
         return None
@@ -58,8 +56,8 @@ def late_by(part: Formula, samples: Mapping[str, Floats], now: int) -> int | Non
 
 
 def later(part: Formula, late: int) -> Formula | None:
-    """The same with the window of its F or U, alone or below a G as in a patrol, ending so much later; or
-    that of its G over a predicate beginning so much later.
+    """The same conjunct, in which the window of an F or U, alone or below a G as in a patrol, ends so many
+    steps later, or that of a G over a predicate begins so many steps later; None for other conjuncts.
     """
     match part:
         case Eventually(a, b) | Until(a, b):
@@ -74,15 +72,18 @@ def later(part: Formula, late: int) -> Formula | None:
 
 
 def may_be_late(part: Formula, samples: Mapping[str, Floats], now: int) -> bool:
-    """Not a G over a predicate that has begun, or that the robot leaves as it begins."""
+    """Whether time may be what a conjunct lacks. It is not for a G over a predicate that has begun, or that
+    the robot breaks by leaving as it begins.
+    """
     if not isinstance(part, Always) or not is_predicate(part.child):
         return True
     return part.a > now + 1 or (part.a > now and not _holds(part.child, samples)[now])
 
 
 def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int | None) -> str | None:
-    """What fails of an F, or of an U or G over predicates, along x_0.., and when; None of other conjuncts,
-    and where nothing fails. samples {name: [m]}; now: the last step that was driven; late: its `late_by`.
+    """What of an F, or of an U or G over predicates, fails along a trajectory, and when; None for other
+    conjuncts, or if nothing fails. samples {name: [m]}; now: the last step that was driven; late: the
+    conjunct's `late_by`.
     """
     match part:
         case Eventually() if late is not None:
@@ -106,7 +107,7 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
 
 
 def when(part: Formula, late: int) -> str:
-    """When a conjunct is kept, in words, that comes so many steps too late."""
+    """When a conjunct that comes `late` steps too late is kept, in words."""
     match part:
         case Eventually(_, b, child):
             does = "is met" if is_predicate(child) else "begins"
@@ -137,7 +138,7 @@ def _of_until(part: Until, left: Bools, right: Bools) -> str | None:
 
 
 def _holds(predicate: Formula, samples: Mapping[str, Floats]) -> Bools:
-    """At each step [m]; nowhere where the predicate's arithmetic is not finite on some of them."""
+    """Whether a predicate holds at each step [m]; False at all if its arithmetic is not finite at one."""
     each = {name: values[:, None] for name, values in samples.items()}  # every step is a trajectory of one
     return np.asarray(values_of(predicate, each) > SATISFIED_ABOVE)
 

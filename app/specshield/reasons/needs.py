@@ -1,7 +1,7 @@
 """What keeping a formula needs of a trajectory: predicates that have to hold within windows of steps.
 
-Every trajectory that satisfies the formula meets all needs of at least one of its alternatives. The other way
-round is not so: what is hard to say as a need is left out. So where no trajectory can meet the needs of any
+Every trajectory that satisfies the formula meets all needs of at least one of its alternatives. The converse
+is not true: what is hard to say as a need is left out. So if no trajectory can meet the needs of any
 alternative, none satisfies the formula.
 """
 
@@ -22,8 +22,8 @@ MOST_INSTANTS = 8  # steps of a G at which an F below it is asked for
 class Need:
     """`predicate` holds at every step from s to s + stay, for some step s from `first` to `last`.
 
-    part: the need as the formula has it, where some of its window is over by now. before: what has to hold at
-    every step to come until then, as the left side of an until.
+    part: the need as it stands in the formula, if part of its window is over. before: what has to hold at
+    every step until then, as the left side of an until does.
     """
 
     predicate: Formula
@@ -57,7 +57,7 @@ IMPOSSIBLE: Alternatives = ()
 class Reader:
     """Reads the needs out of formulas.
 
-    now: the step up to which the trajectory is known. constant: given a predicate and a step, its truth where
+    now: the step up to which the trajectory is known. constant: given a predicate and a step, its truth if
     that is the same at every step from that one on, whatever the robot does; else None.
     """
 
@@ -69,7 +69,7 @@ class Reader:
         return self._some(positive(formula), 0, 0)
 
     def _some(self, formula: Formula, a: int, b: int) -> Alternatives:
-        """What it needs that the formula holds at some step from a to b."""
+        """What is needed for the formula to hold at some step from a to b."""
         if is_predicate(formula):
             return self._asked(Need(formula, a, b, 0, Eventually(a, b, formula) if b else formula))
         match formula:
@@ -81,7 +81,7 @@ class Reader:
                 return self._some(child, a + c, b + d)
             case Always(c, d, child) if is_predicate(child):
                 return self._asked(Need(child, a + c, b + c, d - c))
-            case Always(c, d, child) if a + d >= b + c:  # these steps count, whichever the step is
+            case Always(c, d, child) if a + d >= b + c:  # steps in the window for any step from a to b
                 return self._every(child, b + c, a + d)
             case Always(c, d, child):
                 return self._some(child, a + c, b + d)
@@ -93,7 +93,7 @@ class Reader:
         return NOTHING
 
     def _every(self, formula: Formula, a: int, b: int) -> Alternatives:
-        """What it needs that the formula holds at every step from a to b."""
+        """What is needed for the formula to hold at every step from a to b."""
         if is_predicate(formula):
             return self._asked(Need(formula, a, a, b - a))
         if a == b:

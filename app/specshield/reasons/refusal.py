@@ -1,4 +1,4 @@
-"""What is said of a rule that no policy can keep from here: "none was found", or "none exists" and why."""
+"""What is said of a rule that no policy keeps from here: no way was found, or none exists, and why."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ class Refusal:
 
 
 def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tuple[bool, bytes | None]:
-    """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule, and such a
-    way (as `Carry` has it) where a search found one and no policy did.
+    """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule; and such a
+    way (`Carry.way`) if a search found one and no policy did.
 
     Raises InputError for a session that would end before its rule is decided, PoseError, and InfeasibleStart
     unless `allow_infeasible`.
@@ -80,8 +80,8 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
 def switch(
     shield: Shield, history: Floats, signals: Signals | None, carry: Carry, elsewhere: bool
 ) -> bytes | None:
-    """As in shield/switching.py; a way that a search found where no policy did is returned, as `begin` does.
-    The InfeasibleSwitch that is raised says what is wrong with the rule.
+    """As in shield/switching.py, but a way is returned if a search found one and no policy did, as by
+    `begin`, and InfeasibleSwitch says what is wrong with the rule.
     """
     try:
         switching.switch(shield, history, signals, carry, elsewhere)
@@ -104,8 +104,8 @@ def refusal(
 ) -> Refusal:
     """Why the shield's rule cannot be kept after x_0..x_t, or was not found to be.
 
-    history [t + 1, 3], signals {name: [t + 1]}, which are taken to hold their last values; sure: the robot on
-    a map that holds nothing that was merely guessed, on which alone something is proved.
+    history [t + 1, 3], signals {name: [t + 1]}, which are taken to keep their last values; sure: the robot on
+    a map without guesses; what is proved is proved on that map.
     """
     relaxed = relaxations(shield, history, signals)
     if relaxed.way is not None:
@@ -127,7 +127,7 @@ def refusal(
 
 
 def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
-    """What the conjuncts say of it, in words; tried: how many ways were."""
+    """What is wrong with the rule, in words. tried: how many ways were judged."""
     if not conjuncts:
         return "The rule reads neither poses nor signals, so no motion changes whether it is kept."
     failing = [each for each in conjuncts if not each.feasible_alone]

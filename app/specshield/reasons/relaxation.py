@@ -1,8 +1,8 @@
 """What is wrong with a rule that cannot be kept from here: its conjuncts, each alone and beside the others.
 
 Futures are gathered from the policies and from a search (search.py): for each conjunct alone, and for all of
-them where one may be late. They are simulated with f and measured; what is said of a conjunct is what some
-future shows of it.
+them while one may be late. They are simulated with f and measured. Whatever is said of a conjunct is shown by
+some future.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import futures, prefix_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
-MOST_LATE = 150  # [steps] that a window is tried to end later, at most. Chosen by hand
+MOST_LATE = 150  # [steps] the most by which a window is tried to end later. Chosen by hand
 MOST_TRIED = 3  # alternatives of one conjunct, or of all, that are searched for
-MOST_CONJUNCTS = 8  # that are searched for; of further ones the policies' futures alone tell
+MOST_CONJUNCTS = 8  # that are searched for; further ones are judged by the policies' futures alone
 
 
 class Conjunct(NamedTuple):
     """One conjunct of a rule that cannot be kept.
 
     feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
-    highest found beside the others, where it can be kept alone and they can without it, else of it alone [m];
-    -inf where nothing was tried. late_by: how many steps later its window would have to end (that of a G over
-    a place, to begin), for it alone where it is not feasible alone, else for the whole rule; None where none
-    was found to do. only: whether this is all that the whole rule lacks.
+    highest found [m], among the futures that keep all other conjuncts if there are any and it is feasible
+    alone, else among all; -inf if nothing was tried. late_by: by how many steps its window would have to end
+    later (that of a G over a predicate, to begin later), for the whole rule if it is feasible alone, else for
+    the conjunct alone; None if no number was found that is enough. only: whether this is all that the whole
+    rule lacks.
     """
 
     formula: Formula
@@ -49,8 +50,8 @@ class Conjunct(NamedTuple):
 
 
 class Relaxed(NamedTuple):
-    """conjuncts: of the rule. tried: how many futures were judged. way: the motions, one a byte, of one that
-    keeps the rule, which the policies did not find.
+    """conjuncts: of the rule. tried: how many futures were judged. way: the motions, one a byte, of a future
+    that keeps the rule, which the policies did not find.
     """
 
     conjuncts: tuple[Conjunct, ...]
@@ -100,8 +101,8 @@ def _told(part: Formula, i: int, rho: Floats, late: Floats, keeps: Bools) -> Con
 class _Gathered:
     """Futures, by what each of them says of the conjuncts.
 
-    rho: [conjuncts, n] of n futures each [m]. late: likewise, the steps by which each comes too late: 0 where
-    it keeps the conjunct, inf where no later end of the window would do.
+    rho: arrays [conjuncts, n], each for n futures [m]. late: arrays of the same shapes: by how many steps
+    each comes too late, 0 if it keeps the conjunct, inf if no later end of the window is enough.
     """
 
     shield: Shield
@@ -135,8 +136,8 @@ def _late(part: Formula, samples: Mapping[str, Floats], now: int) -> float:
 
 
 def _gather(gathered: _Gathered) -> None:
-    """The policies' futures; then, as far as these leave it open, a search for the whole rule, for each
-    conjunct alone, and for all where one of them may be late or is left out.
+    """Judges the policies' futures. As far as these leave questions open, it then searches for the whole
+    rule, for each conjunct alone, and for all of them while one may be late or is left out.
     """
     shield, known, parts = gathered.shield, gathered.known, gathered.parts
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
@@ -174,7 +175,7 @@ def _gather(gathered: _Gathered) -> None:
 def _found(
     shield: Shield, known: Known, ground: Ground, ways: Alternatives, may_be_late: Alternatives
 ) -> Iterator[Ints]:
-    """Futures [1, m] that meet the needs of some alternative; those of `may_be_late` may begin later."""
+    """Futures [1, m] that meet the needs of some alternative; needs in `may_be_late` may be met later."""
     late = {need.formula for way in may_be_late for need in way}
     for needs in ways[:MOST_TRIED]:
         relaxed = [_relaxed(need) if need.formula in late else need for need in needs]
@@ -189,14 +190,14 @@ def _found(
 
 
 def _relaxed(need: Need) -> Need:
-    """The same, but it may end later; or begin later, where it holds throughout a window that is to come."""
+    """The same need, which may be met later; one that holds throughout a window may begin later in it."""
     if need.first == need.last and need.stay:
         return replace(need, last=need.end, stay=0, part=need.formula)
     return replace(need, last=need.last + MOST_LATE, part=need.formula)
 
 
 def _want(goal: Goal, late: bool) -> Wanted:
-    """A guard whose window is to come is wanted at its first step; being kept then, it is kept on."""
+    """What a search wants of a goal; of a guard, its first step alone, since guards are kept anyway."""
     need = wanted = goal.need
     if need.first == need.last:
         wanted = replace(need, stay=0)

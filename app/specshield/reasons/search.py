@@ -1,9 +1,9 @@
-"""A search for a future that meets given needs, whatever policies there are: step by step, in simulation.
+"""A search for a future that meets given needs, without policies: step by step, in simulation.
 
 It begins with every pose that one motion leads to, and goes on from those that leave the most steps to spare
-on the way to the goals (ground.py). A place is searched from once, when it is first reached, and again when
-some window opens or closes. What it finds is simulated with f and can be judged like any other future. That
-it finds nothing proves nothing.
+on the way to the goals (ground.py). It goes on from a place once, when that is first reached, and again when
+some window opens or closes. What it finds is simulated with f and can be judged like any other future. If it
+finds nothing, that proves nothing.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from specshield.stl import SATISFIED_ABOVE
 
 # Chosen by hand: a search takes a second at most.
 MOST_NODES = 60_000
-WIDTH = 120  # poses that one step goes on from, for each set of goals that are met,
-MOST_MOTIONS = 1_500  # and motions from all of these
-BEHIND = 8.0  # [steps] to spare by which these may fall behind the best: what it takes to turn round
-CELL, HEADINGS = 0.05, 120  # [m] and per turn: poses that are one place
+WIDTH = 120  # poses that one step goes on from, for each set of goals that are met
+MOST_MOTIONS = 1_500  # made from all of these poses
+BEHIND = 8.0  # [steps] such a pose may have fewer to spare than the best one: what it takes to turn round
+CELL, HEADINGS = 0.05, 120  # poses in one cell [m] and one of so many headings are one place
 
 
 class Wanted(NamedTuple):
-    """What a way has to meet: `far` [m] of the ground's squares from where that may be, and the last step to
-    begin it by, which is later than the need has it where it may be late.
+    """A need that a way has to meet. far [m]: from each of the ground's squares to where it may be met. due:
+    the last step to begin it by, which is later than the need says if that may be late.
     """
 
     need: Need
@@ -43,7 +43,7 @@ class Wanted(NamedTuple):
 
 @dataclass
 class _Tree:
-    """What was reached: of each node its step, its parent and the motion that led there."""
+    """The poses that were reached: for each node its step, its parent and the motion that led there."""
 
     rows: list[tuple[Ints, Ints, Ints]] = field(default_factory=list)
     size: int = 0
@@ -54,7 +54,7 @@ class _Tree:
         return np.arange(self.size - len(parent), self.size)
 
     def way(self, node: int, wait: int) -> list[int]:
-        """The motions to a node; where time passed between two nodes the robot waited."""
+        """The motions to a node; the robot waits if more than one step lies between two nodes."""
         step, parent, motion = (np.concatenate(each) for each in zip(*self.rows, strict=True))
         back: list[int] = []
         while parent[node] >= 0:
@@ -81,7 +81,7 @@ def search(
     pool: list[tuple[Ints, Floats, Ints]] = []
     seen = np.empty(0, np.int64)
     for step in range(now + 1, until + 1):
-        if step in events and waits and pool:  # who waited somewhere may go on from there
+        if step in events and waits and pool:  # a robot that waited anywhere may go on from there
             ids, poses, met = (np.concatenate(each) for each in zip(*pool, strict=True))
             run, seen = np.zeros((len(ids), len(goals)), np.int64), np.empty(0, np.int64)
             chosen = _best(goals, ground, poses, met, run, step - 1, width)
@@ -149,12 +149,12 @@ def _key(poses: Floats, met: Ints, run: Ints) -> Ints:
 def _best(
     goals: Sequence[Wanted], ground: Ground, poses: Floats, met: Ints, run: Ints, step: int, width: int
 ) -> Ints:
-    """Which of the poses to go on from: those with the most steps to spare, of each set of goals met."""
+    """The poses to go on from: for each set of goals that are met, those with the most steps to spare."""
     at = ground.squares(poses)
     spare, hopeless = np.full(len(poses), np.inf), np.zeros(len(poses), np.bool_)
     for k, goal in enumerate(goals):
         ahead = np.ceil(goal.far[at] / ground.travel - 1e-9) if ground.travel > 0.0 else goal.far[at]
-        ahead = np.where(run[:, k] > 0, 1 - run[:, k], ahead)  # what is being met was begun in time
+        ahead = np.where(run[:, k] > 0, 1 - run[:, k], ahead)  # a goal that is being met was begun in time
         is_open = met >> k & 1 == 0
         hopeless |= is_open & (step + ahead > goal.due)
         spare = np.where(is_open, np.minimum(spare, goal.due - step - ahead), spare)

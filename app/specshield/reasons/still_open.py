@@ -1,4 +1,4 @@
-"""What a prefix leaves open of a formula, as a formula."""
+"""The part of a formula that a prefix leaves open, as a formula."""
 
 from __future__ import annotations
 
