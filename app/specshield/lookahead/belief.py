@@ -2,9 +2,9 @@
 stand-ins can be trusted to say what it will do.
 
 At each step every goal, and wandering, is charged the KL of what the model said from what the stand-in
-(surrogate.py) would have said. What has been charged least is the likeliest. The model's habits, a running
-average of what it said, predict it too. Where they predict it far better than the stand-ins do, the trust
-falls to nothing, and look-ahead with it.
+(surrogate.py) would have said. The one that has been charged least is the likeliest. The model's habits, a
+running average of what it said, predict it too. If they predict it far better than the stand-ins do, the
+trust falls to nothing, and look-ahead has no effect.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from specshield.robot.dynamics import Body, displacements
 
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
 STYLE = np.array([2.0, 2.0, -2.0, -1.0])  # of an unknown model: the logit of each feature
-SURE = 3.0  # observations that STYLE counts for
-KEEP = 0.97  # of the charges from one step to the next: models change their minds
-TRACK = 0.95  # of the record of predictions from one step to the next
-HABITS = 0.1  # of the running average that a new observation makes up
-DOUBT = 6.0  # [nats] by which habits predict better, over the last 1 / (1 - TRACK) steps, at trust 0.5
-WARY = 6.0  # [nats] of that before anything is seen: a model that ends soon by itself is best left alone
-SHARP = 20.0  # a KL is charged for a whole distribution, which tells more than one draw from it would
-POSSIBLE = 0.03  # of the likeliest goal's probability: goals below that are left out
-FLOOR = 0.03  # of a stand-in's mass is spread over all motions: no observation rules a goal out
-LEAST_SAID = 1e-6  # the probability of a motion that the model rules out, for its logarithm
-FLATTEST, STEEPEST = 0.5, 4.0  # logits a feature that are believed of a model
+SURE = 3.0  # for how many observations STYLE counts
+KEEP = 0.97  # the share of the charges that is kept from one step to the next: models change their minds
+TRACK = 0.95  # the same for `excess`
+HABITS = 0.1  # the weight of a new observation in the running average
+DOUBT = 6.0  # [nats] the excess at which the trust is 0.5; it goes back about 1 / (1 - TRACK) steps
+WARY = 6.0  # [nats] the excess at first: a model that ends soon by itself is best left alone
+SHARP = 20.0  # weighs the charges: a KL is of a whole distribution, which tells more than one draw from it
+POSSIBLE = 0.03  # goals with a smaller share of the likeliest goal's probability are left out
+FLOOR = 0.03  # the share of a stand-in's mass that is spread over all motions: nothing rules a goal out
+LEAST_SAID = 1e-6  # the probability that counts for a motion that the model rules out
+FLATTEST, STEEPEST = 0.5, 4.0  # the range of logits a feature that a model is believed to have
 
 
 @dataclass(frozen=True)
 class Belief:
     """cost [G + 1]: what each goal and, last, wandering have been charged [nats]. normal [F, F], moment [F]:
     the normal equations of the least squares that fit the model's style. habit [M]: the running average of
-    the probabilities of its motions. excess: the running sum of what the likely stand-ins were charged above
-    what the habit was [nats]. forced: what the rule has cost the model so far, had every answer been the
+    the probabilities of its motions. excess: the running sum of what the likely stand-ins were charged more
+    than the habit was [nats]. forced: what the rule would have cost the model so far if every answer had been
     projection's [nats].
     """
 
@@ -66,7 +66,7 @@ class Belief:
         return np.array([sharp, sharp, -sharp, fitted[3]])
 
     def probabilities(self) -> Floats:
-        """That the model goes to each goal, 0 for those hardly possible, and that it wanders, (G + 1,)."""
+        """The probabilities that the model goes to each goal, and last that it wanders, (G + 1,)."""
         goals, wander = self.cost[:-1], self.cost[-1]
         odds = exp(SHARP * (goals.min() - goals))
         odds[odds < POSSIBLE] = 0.0
@@ -108,7 +108,7 @@ def update(
     blocked = blocked_at(body, x, y, theta)
     charges = _charge(body, goals, belief.style, (x, y, theta), blocked, said, log_said, end)
     usual = float(inner(said, log_said - log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
-    sided = _sided(body, said)  # one that wanders turns to either side: to which is no error of the stand-in
+    sided = _sided(body, said)  # a stand-in that wanders does not say to which side the model turns
     excess = TRACK * belief.excess + float(inner(belief.probabilities(), charges)) - usual
     excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
@@ -149,8 +149,8 @@ def _charge(
     log_said: Floats,
     end: float,
 ) -> Floats:
-    """Of each goal and of wandering: the KL of the motions said from the stand-in's, and the log loss of the
-    end, [G + 1].
+    """What each goal and wandering are charged, [G + 1]: the KL of the motions said from the stand-in's, and
+    the log loss of the chance to end.
     """
     motions, wander = said.shape[0], goals.distance.shape[0]
     charges, log_r = np.empty(wander + 1), np.empty(motions)

@@ -27,13 +27,14 @@ from specshield.policy.lattice import coordinates, corner
 from specshield.robot.dynamics import Body, displacement
 
 UNKEEPABLE = np.float32(1e6)  # D where the rule cannot be kept
-TIGHT = np.float32(6.0)  # [nats] D of a corner from which it cannot, beside others; by hand, nothing measured
+# [nats] The price of corners from which the rule cannot be kept, beside others. By hand, nothing measured.
+TIGHT = np.float32(6.0)
 CODES = 32.0  # table codes a nat, which reach to 2,047 nats
 NO_CODE = 65535
 
 
 class Sums(NamedTuple):
-    """Scratch of one step back over n cells: cost [M, n] of each motion, the least and the total of all."""
+    """Scratch of one step back over n cells: cost [M, n] of each motion; least and total [n] of all."""
 
     cost: Singles
     least: Singles
@@ -142,7 +143,9 @@ def _back(
 
 @kernel
 def _mix(a: Singles, b: Singles, part: np.float32, out: Singles) -> None:
-    """As `_blend`, of two; part: the share of b. It takes two thirds of the time, and most motions turn."""
+    """As `_blend`, between two. part: the share of b. Most motions turn, and this takes two thirds of the
+    time of `_blend`.
+    """
     zero, one = np.float32(0.0), np.float32(1.0)
     for c in range(out.shape[0]):
         va, vb = one - part if a[c] < UNKEEPABLE else zero, part if b[c] < UNKEEPABLE else zero
@@ -172,8 +175,8 @@ def _blend(g: Singles, at: int, width: int, p: np.float32, q: np.float32, out: S
 
 @kernel
 def _charge(free: Singles, stay: Singles, log_r: Singles, cost: Singles, least: Singles) -> None:
-    """From D after a motion to D - log r, in place, and the least of all motions so far. A motion that is
-    stopped short leaves the robot where it is, for whose D see `stay`.
+    """Replaces D after a motion, in `cost`, by D - log r, and updates the least of all motions so far. A
+    motion that is stopped short leaves the robot where it is, where D is `stay`.
     """
     for c in range(cost.shape[0]):
         value = (cost[c] if free[c] > np.float32(0.0) else stay[c]) - log_r[c]

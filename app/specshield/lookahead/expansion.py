@@ -39,10 +39,10 @@ def expand_all(
 ) -> None:
     """D after each motion from x_t, into out (K, M), for the K tables asked for.
 
-    tables [B, kept, H, rows]: codes of D; leads [B]: the goal of the stand-in that each is for, or WANDER;
-    asked (K,): which tables. style (FEATURES,): of the stand-ins. mask: the goals of the formula settled at
-    t. The poses form a tree: level d holds the M^d poses at t + d, and the children of its node n are nodes
-    M n to M n + M - 1 of the next level.
+    tables [B, kept, H, rows]: codes of D; leads [B]: the goal of each table's stand-in, or WANDER; asked
+    (K,): which tables. style (FEATURES,): of the stand-ins. mask: the goals of the formula settled at t. The
+    poses form a tree: level d holds the M^d poses at t + d, and the children of its node n are nodes M n to
+    M n + M - 1 of the next level.
     """
     motions, horizon = out.shape[1], planes.slot.shape[0] - 2
     levels = min(DEPTH + 1, horizon - t)

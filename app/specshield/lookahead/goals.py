@@ -19,7 +19,7 @@ MAX_GOALS = 300  # keeps a decision short: each goal is compared with what the m
 GAP = 0.5  # [m] between goals, where that makes no more than MAX_GOALS
 WAY_PITCH = 0.1  # [m] of the grid that ways are kept on, where that makes no more than MAX_CELLS
 MAX_CELLS = 20_000  # keeps memory small: MAX_GOALS fields of so many cells and 4 bytes are 24 MB
-STEER = 5  # [cells] how far along the way the point lies that the robot steers for
+STEER = 5  # [cells] how far along the way lies the point for which the robot steers
 UNIT = 127  # of a direction's components, as stored in a byte
 NO_PATH = 65535  # [cm] the distance from where no path leads to a goal
 
@@ -27,8 +27,8 @@ NO_PATH = 65535  # [cm] the distance from where no path leads to a goal
 class Goals(NamedTuple):
     """G goals and the way to each, on a grid of h x w cells of `pitch` [m] in the grid frame.
 
-    distance [G, h, w] [cm]: along space in which the robot can turn; from beside an obstacle to that space;
-    and through doors too narrow to turn in where there is no other way. NO_PATH where there is none at all.
+    distance [G, h, w] [cm]: along space in which the robot can turn, plus the way from beside an obstacle to
+    that space; through doors too narrow to turn in if there is no other way; NO_PATH if there is none at all.
     way [G, h, w, 2]: the direction (u, v) to go, times UNIT; zero at the goal.
     """
 

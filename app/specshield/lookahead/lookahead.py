@@ -1,7 +1,7 @@
 """Look-ahead: inside the feasible set S_t, weigh what the model wants by what it will cost the model later.
 
-Projection lets the model put a visit off, step after step, until it is forced. Look-ahead spreads that force
-over the path, from the step on at which the rule has cost the model FORCED. Until then it answers as
+Projection lets the model put a visit off, step after step, until the visit is forced. Look-ahead spreads that
+force over the path, from the step on at which the rule has cost the model FORCED. Until then it answers as
 projection does, so a rule that the model keeps almost by itself costs no more with look-ahead.
 
 It has stand-ins for the model: one for each of some places that the model may be going to, and one that
@@ -41,13 +41,13 @@ from specshield.task import Task
 
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
 LEAD_GAP = 1.0  # [m] along free space between the places that have a table, where that makes few enough
-WORK = 200_000_000  # entries that are solved for a task, at most, where that leaves FEWEST places
+WORK = 200_000_000  # entries that are solved for a task, at most, but for no fewer than FEWEST places
 MOST, FEWEST = 64, 8  # places that have a table
-REACH = 0.3  # [m] further off than the nearest, at which a place stands for a goal 1 / e as much
-LEADERS = 16  # tables that a decision asks
-FORCED = 1.0  # [nats] of KL that the rule has cost, before which nothing is weighed: evaluation/rivals.py
-NEGLIGIBLE = 0.02  # a probability, or trust, that is not worth the work
-WORST = 10.0  # [nats] above the worst action that has a D, for those that have none
+REACH = 0.3  # [m] a place this much farther away than the nearest stands for a goal 1 / e as much as that
+LEADERS = 16  # tables that a decision reads
+FORCED = 1.0  # [nats] of KL that the rule has to have cost before anything is weighed: evaluation/rivals.py
+NEGLIGIBLE = 0.02  # a smaller probability, or trust, is not worth the work
+WORST = 10.0  # [nats] D of actions that have none, above the worst action that has one
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +80,11 @@ class LookAhead:
     ) -> tuple[bytes, Floats]:
         """As `Preference.step`. The memory is the belief.
 
-        The log-weight of an action is -trust * D of the pose it leads to, D taken from its least value: at
-        most 0, and 0 for a terminal action, where nothing is known, until the rule has cost FORCED, and once
-        it is over.
+        The log-weight of an action is -trust * (D of the pose it leads to - the least such D), so at most 0.
+        It is 0 for a terminal action, if nothing is known, until the rule has cost FORCED, and once the rule
+        is over.
         """
-        if len(memory) != len(begun := self.begin()):  # it was written by another version
+        if len(memory) != len(begun := self.begin()):  # another version wrote it
             memory = begun
         robot, pose = self.task.robot, history[-1]
         belief = Belief.from_bytes(memory, len(robot.motions))
@@ -130,7 +130,7 @@ class LookAhead:
         known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
-        # A model twice as sharp costs twice as much to bend, and that is most of D.
+        # Most of D is the cost of bending the model, which is proportional to how sharp the model is.
         sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
         total = inner(np.where(known, costs, 0.0).T, weights[asked] / weights[asked].sum() * sharp)
         result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)

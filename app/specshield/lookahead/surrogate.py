@@ -2,9 +2,9 @@
 
 The first goes to one of the goals (goals.py). The logit of each of its motions is linear in what the motion
 saves: metres towards the goal along free space, and turning towards the way there. The second searches: it
-goes ahead where it can, else turns, and hardly ever backs up or stands still. Both say their motions given
-that they do not end, and the chance that they end. The steps that the rule takes from either have a price.
-Which of them the model is like, where it goes and how sharply, is what a session learns (belief.py).
+goes ahead where it can, else turns, and hardly ever backs up or stands still. Both give the probabilities of
+their motions if they do not end, and the chance that they end. Steps that the rule costs them have a price.
+A session learns which of them the model is like, where it goes and how sharply (belief.py).
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ END_WITHIN = 1.0  # [m] from its goal, the model may end
 END_SLOPE = 0.07  # [m] within which that changes
 END_CHANCE = 0.25  # a step, near the goal
 WANDER_END = 0.01  # the chance a step that one that wanders ends
-AHEAD, TURN, OTHER = 3.3, 2.0, -2.0  # logits of one that wanders: the longest move ahead, the largest turn
+AHEAD, TURN, OTHER = 3.3, 2.0, -2.0  # logits when wandering: the longest move ahead, the largest turn, others
 PRICE = 1.0  # [nats] of a step that the rule keeps the model from its goal
-SEARCH_PRICE = 10.0  # [nats] the same for one that wanders: it goes on searching once the rule is settled
-LEAST_MOTION = 1e-9  # [m], [rad] divides in place of the longest move or turn of a robot that has none
+SEARCH_PRICE = 10.0  # [nats] the same when wandering: the search goes on once the rule is settled
+LEAST_MOTION = 1e-9  # [m], [rad] the divisor for a robot without moves, or without turns
 
 
 @leaf
