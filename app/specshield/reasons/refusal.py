@@ -17,9 +17,8 @@ from specshield.reasons.bound import proof
 from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
-from specshield.shield import switching
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.episode import Signals, start
+from specshield.shield.episode import Signals, check_switch, start
 from specshield.shield.taught import on_map, teach
 from specshield.world.learned import SENT, forget
 
@@ -80,11 +79,11 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
 def switch(
     shield: Shield, history: Floats, signals: Signals | None, carry: Carry, elsewhere: bool
 ) -> bytes | None:
-    """As in shield/switching.py, but a way is returned if a search found one and no policy did, as by
-    `begin`, and InfeasibleSwitch says what is wrong with the rule.
+    """`check_switch`, but a way is returned if a search found one and no policy did, as by `begin`; and the
+    InfeasibleSwitch says what is wrong with the rule.
     """
     try:
-        switching.switch(shield, history, signals, carry, elsewhere)
+        check_switch(shield, history, signals, carry, elsewhere)
         return None
     except InfeasibleSwitch as error:
         taught, _ = teach(shield, carry, history, None, None)
@@ -94,7 +93,7 @@ def switch(
         if told.way is not None:
             found = carry._replace(way=told.way)
             with suppress(InfeasibleSwitch):
-                switching.switch(shield, history, signals, found, elsewhere)
+                check_switch(shield, history, signals, found, elsewhere)
                 return told.way
         raise error.retold(f"the new rule was not taken: {told.message}", **told.details) from None
 

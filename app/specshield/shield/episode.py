@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
-from specshield.errors import InfeasibleStart, PoseError
+from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
 from specshield.robot.dynamics import Body, in_collision, simulate, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
@@ -75,6 +75,24 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
             got=[round(v, 3) for v in pose],
             expected="a pose from which the rule can be kept; or allow_infeasible",
         )
+
+
+def check_switch(
+    shield: Shield, history: Floats, signals: Signals | None, carry: Carry | None, elsewhere: bool
+) -> None:
+    """Checks that the rule of `shield` can be kept from x_t on, as the next decision will see it.
+
+    history [t + 1, 3], signals {name: [t + 1]}: since the step from which the rule's windows count. carry:
+    what the next decision will be given. elsewhere: whether the map or the robot has changed; x_t is then
+    checked as an initial pose is. Raises PoseError, InfeasibleSwitch.
+    """
+    if elsewhere:
+        check_place(shield, history[-1], "poses")
+    found = decide(shield, history, None, True, signals, carry)
+    if found.spec_status == "satisfied" or found.mode == "completion":
+        return
+    expected = "a rule that can be kept from x_t" + ("; or clock 'restart'" if len(history) > 1 else "")
+    raise InfeasibleSwitch("no way keeps the new rule from x_t on", path="policy_id", expected=expected)
 
 
 def check_place(shield: Shield, pose: Floats, path: str) -> None:
@@ -239,9 +257,7 @@ def _history(poses: ArrayLike) -> Floats:
 
 @leaf
 def _look_around(body: Body, pose: Floats, nexts: Floats) -> bool:
-    """Writes where each motion leads from a pose (3,) into nexts (M, 3); returns whether the pose is in
-    collision.
-    """
+    """Writes where each motion leads from a pose (3,) into nexts (M, 3); True if the pose is in collision."""
     successors(body, pose, nexts)
     return in_collision(body, pose[0], pose[1], pose[2])
 
@@ -259,10 +275,8 @@ def _wrapped(poses: Floats) -> bool:
 def _follow(
     carry: Carry | None, poses: Floats, steps: int, body: Body
 ) -> tuple[bytes | None, tuple[float, float] | None]:
-    """What is left of the witness that the robot follows, as motions from x_t, None if it follows none; how
-    far x_t is from the nearest pose that the last decision foresaw [m], [rad], None if it foresaw none.
-
-    steps: T - t. A new rule's way (`Carry.way`) comes before any witness.
+    """What is left of the witness that the robot follows, or a new rule's `Carry.way`, as motions from x_t;
+    and how far x_t is from the nearest pose that the last decision foresaw [m], [rad]. steps: T - t.
     """
     way = None if carry is None else carry.way
     if way is not None and (len(way) != steps or max(way, default=0) >= len(body.translate)):
