@@ -98,36 +98,33 @@ def ask(
     try:
         name = str(proposer.id)[:80]
         given = proposer.propose(history.copy(), {n: v.copy() for n, v in signals.items()}, margin)
-        motions, preferred = _checked(given, count, steps, least)
-    except _Refused as refused:
-        return None, f"policy {name!r} was not used at this step: {refused}"
+        found = _checked(given, count, steps, least)
     except Exception as error:  # whatever a proposer does wrong, the step is still decided
         log.warning("a policy failed to propose", exc_info=True)
         return None, f"a policy was not used at this step: it raised {type(error).__name__}"
-    return Proposal(motions, preferred), None
+    if isinstance(found, str):
+        return None, f"policy {name!r} was not used at this step: {found}"
+    return found, None
 
 
-class _Refused(Exception):
-    """Its text says what is wrong with a proposal."""
-
-
-def _checked(given: object, count: int, steps: int, least: int) -> tuple[Ints, int]:
+def _checked(given: object, count: int, steps: int, least: int) -> Proposal | str:
+    """A copy of a proposal, or what is wrong with it."""
     if not isinstance(given, Proposal):
-        raise _Refused(f"it returned {type(given).__name__}; expected a Proposal")
+        return f"it returned {type(given).__name__}; expected a Proposal"
     motions, preferred = given.motions, given.preferred
     if not isinstance(motions, np.ndarray) or motions.dtype.kind not in "iu":
-        raise _Refused("its motions are not an array of integers")
+        return "its motions are not an array of integers"
     if motions.ndim != 2 or motions.shape[1] != steps or not least * steps <= motions.size <= MAX_MOTIONS:
         rows = f"N from {least} to {MAX_MOTIONS // steps}"
-        raise _Refused(f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], {rows}")
+        return f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], {rows}"
     own = np.array(motions, np.int64, order="C")
     wrong = _first_outside(own, count)
     if wrong is not None:
-        raise _Refused(f"it names motion {wrong}; the robot has motions 0 to {count - 1}")
+        return f"it names motion {wrong}; the robot has motions 0 to {count - 1}"
     whole = isinstance(preferred, (int, np.integer)) and not isinstance(preferred, bool)
     if not (whole and 0 <= preferred < count):
-        raise _Refused(f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}")
-    return own, int(preferred)
+        return f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}"
+    return Proposal(own, int(preferred))
 
 
 @kernel
