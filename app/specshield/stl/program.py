@@ -75,12 +75,9 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
             if name not in slots:
                 raise FormulaError(f"nothing declares '{name}'", got=name, expected=", ".join(sorted(slots)))
             yield VALUE, slots[name]
-        case Neg(child) | Not(child):
+        case Neg(child) | Not(child) | Abs(child):
             yield from _code(child, slots)
-            yield NEGATE, 0
-        case Abs(child):
-            yield from _code(child, slots)
-            yield ABSOLUTE, 0
+            yield ABSOLUTE if isinstance(node, Abs) else NEGATE, 0
         case Arithmetic(op, left, right):
             yield from _code(left, slots)
             yield from _code(right, slots)

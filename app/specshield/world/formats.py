@@ -58,8 +58,8 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     wrong way, MapError for a member that is missing, unknown or wrong.
     """
     if name is None:
-        said, names = "the body does not say which format the map has", _one_of(FORMATS.names())
-        raise InputError(said, path="format", expected=names)
+        said = "the body does not say which format the map has"
+        raise InputError(said, path="format", expected=f"one of {', '.join(FORMATS.names())}")
     format = FORMATS.get(str(name))
     if format.files != files:
         ways = {True: "files (multipart/form-data)", False: "a JSON object"}
@@ -72,11 +72,7 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
             raise MapError(f"{member} is missing", path=member, expected=expected)
     for member in members:
         if member not in format.members:
-            told, expected = f"the format {name} has no such member", _one_of(sorted(format.members))
-            raise MapError(told, path=str(member)[:200], got=members[member], expected=expected)
+            told, known = f"the format {name} has no such member", ", ".join(sorted(format.members))
+            raise MapError(told, path=str(member)[:200], got=members[member], expected=f"one of {known}")
     defaults = {member: schema["default"] for member, schema in format.members.items() if "default" in schema}
     return format.parse(**{**defaults, **members})
-
-
-def _one_of(names: list[str]) -> str:
-    return f"one of {', '.join(names)}"

@@ -96,7 +96,7 @@ def _walls(house: Any) -> Iterator[tuple[Floats, Floats]]:
         for key, identity in (("wall0", first), ("wall1", second)):
             if checks.text(identity, f"{path}.{key}") not in walls:
                 raise checks.wrong("wall", f"{path}.{key}", identity, "the id of a wall of this house")
-        if _passable(door, path):
+        if _passable(door, path, (first, second)):
             start, end = walls[first]
             along = (end - start) / max(float(np.linalg.norm(end - start)), TOUCH)
             hole = [x for x, _, _ in _points(door, "holePolygon", path, 2)]
@@ -107,13 +107,12 @@ def _walls(house: Any) -> Iterator[tuple[Floats, Floats]]:
             yield from _pieces(start, end, gaps.get(identity, []))
 
 
-def _passable(door: Mapping[str, Any], path: str) -> bool:
+def _passable(door: Mapping[str, Any], path: str, walls: tuple[str, str]) -> bool:
     """Whether a robot can pass: an inner door that stands fully open, or a frame without `openness`.
 
     Outer doors, and doors that lead back to their own room, count as closed.
     """
     inner = checks.member(door, "room0", path) != checks.member(door, "room1", path)
-    walls = [str(checks.member(door, key, path)) for key in ("wall0", "wall1")]
     if not inner or any(wall.startswith("wall|exterior") for wall in walls):
         return False
     openness = door.get("openness")
