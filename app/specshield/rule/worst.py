@@ -43,7 +43,7 @@ def worst_signals(task: Task) -> Floats | None:
                 break
             group = names
         left -= group
-        worst = next(filter(None, (_at_worst(asked, each) for each in _values(asked, sorted(group)))), None)
+        worst = next((each for each in _values(asked, sorted(group)) if _at_worst(asked, each)), None)
         if worst is None:
             return None
         held |= worst
@@ -80,13 +80,11 @@ def _numbers(node: Node) -> set[float]:
     return own.union(*(_numbers(part) for part in node.parts))
 
 
-def _at_worst(parts: list[tuple[Formula, bool]], values: dict[str, float]) -> dict[str, float] | None:
-    """The values, if none of the parts helps at them."""
-    for part, helps in parts:
-        try:
-            rho = float(robustness(part, {name: np.array([values[name]]) for name in part.names}))
-        except SampleError:
-            return None
-        if (rho if helps else -rho) > SATISFIED_ABOVE:
-            return None
-    return values
+def _at_worst(parts: list[tuple[Formula, bool]], values: dict[str, float]) -> bool:
+    """Whether none of the parts helps at these values."""
+    samples = {name: np.array([value]) for name, value in values.items()}
+    try:
+        helping = (robustness(part, samples) * (1.0 if helps else -1.0) for part, helps in parts)
+        return not any(value > SATISFIED_ABOVE for value in helping)
+    except SampleError:
+        return False
