@@ -76,9 +76,7 @@ def possible(predicate: Formula, ground: Ground) -> Bools:
 
 
 def _left(need: Need, past: Bools, now: int) -> Need | bool:
-    """What is left of a need that has begun; True if it is met, or may be; False if it is broken. past: at
-    which steps its predicate held.
-    """
+    """What is left of a need that has begun; True: it is, or may be, met; False: it is broken."""
     later, part = max(need.first, now + 1), need.formula
     if need.first == need.last:
         if not past[need.first : need.end + 1].all():

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from specshield.arrays import Bools, Floats
-from specshield.errors import SampleError
-from specshield.stl import Formula, robustness
+from specshield.reasons.lateness import values_of
+from specshield.stl import Formula
 from specshield.task import Task
 
 ROUNDING = 1e-9  # robustness above minus this counts as positive, since compiled code may round otherwise
@@ -50,10 +50,6 @@ class Known:
         return self._holds(predicate, self.task.samples(poses, held), above)
 
     def _holds(self, predicate: Formula, samples: Mapping[str, Floats], above: float) -> Bools:
-        """True, too, where the predicate's arithmetic is not finite on some of them."""
+        """Whether rho is above that at each step; True at all if the arithmetic is not finite at one."""
         each = {name: samples[name][:, None] for name in predicate.names}  # every step is a trajectory of one
-        count = len(next(iter(each.values()))) if each else 1
-        try:
-            return np.asarray(robustness(predicate, each) > above) if each else np.ones(1, np.bool_)
-        except SampleError:
-            return np.ones(count, np.bool_)
+        return np.asarray(values_of(predicate, each, np.inf) > above) if each else np.ones(1, np.bool_)

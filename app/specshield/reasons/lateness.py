@@ -24,13 +24,13 @@ def driven(shield: Shield, history: Floats, motions: Ints) -> Floats:
     return poses
 
 
-def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
-    """rho along each trajectory; -inf on all if the formula's arithmetic is not finite on one of them."""
+def values_of(formula: Formula, samples: Mapping[str, Floats], unknown: float = -np.inf) -> Floats:
+    """rho along each trajectory; `unknown` on all if the formula's arithmetic is not finite on one."""
     some = next(iter(samples.values()))
     try:
         return np.broadcast_to(robustness(formula, {n: samples[n] for n in formula.names}), some.shape[:-1])
     except SampleError:
-        return np.full(some.shape[:-1], -np.inf)
+        return np.full(some.shape[:-1], unknown)
 
 
 def late_by(part: Formula, samples: Mapping[str, Floats], now: int) -> int | None:
@@ -96,13 +96,10 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
             failing = failing[failing >= max(a, now)]
             if not len(failing):
                 return None
-            if not may_be_late(part, samples, now):
-                return f"'{child}' does not hold at step {failing[0]}"
-            met = np.flatnonzero(holds[failing[0] :])
-            if not len(met) or failing[0] > a or failing[0] + met[0] > b:
-                return f"'{child}' does not hold at step {failing[0]}"
-            first = int(failing[0] + met[0])
-            return f"'{child}' holds only from step {first}, {steps(first - a)} too late"
+            met = failing[0] + np.flatnonzero(holds[failing[0] :])
+            if len(met) and failing[0] <= a and met[0] <= b and may_be_late(part, samples, now):
+                return when(part, int(met[0]) - a)
+            return f"'{child}' does not hold at step {failing[0]}"
     return None
 
 
@@ -131,10 +128,9 @@ def _of_until(part: Until, left: Bools, right: Bools) -> str | None:
     first = part.a + int(met[0])
     if first <= part.b:
         return f"{breaks}, before '{part.right}' is met at step {first}" if breaks else None
-    told = f"'{part.right}' is met at step {first}, {steps(first - part.b)} too late"
-    if breaks:
-        return f"{breaks}, and {told}"
-    return f"'{part.left}' holds all the way there, but {told}"
+    if not breaks:
+        return when(part, first - part.b)
+    return f"{breaks}, and '{part.right}' is met at step {first}, {steps(first - part.b)} too late"
 
 
 def _holds(predicate: Formula, samples: Mapping[str, Floats]) -> Bools:

@@ -136,8 +136,8 @@ def _late(part: Formula, samples: Mapping[str, Floats], now: int) -> float:
 
 
 def _gather(gathered: _Gathered) -> None:
-    """Judges the policies' futures. As far as these leave questions open, it then searches for the whole
-    rule, for each conjunct alone, and for all of them while one may be late or is left out.
+    """Judges the policies' futures, then, as far as these leave it open, searches for the whole rule, for
+    each conjunct alone, and for all of them while one may be late or is left out.
     """
     shield, known, parts = gathered.shield, gathered.known, gathered.parts
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
