@@ -48,9 +48,7 @@ def _span(body: Body, low: float, high: float, cells: int) -> tuple[int, int]:
 
 @inlined
 def room_around(body: Body, u: float, v: float) -> float:
-    """How far around a point (grid metres) the clearance field alone shows free space [m]; -inf for a point
-    inside an obstacle.
-    """
+    """How far around a point (grid metres) the clearance alone shows free space [m]; -inf in an obstacle."""
     h = body.resolution
     row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):

@@ -113,9 +113,7 @@ def spread(body: Body, poses: Floats) -> Floats:
 
 
 def holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
-    """The least robustness, at each pose [N], of the children of all formulas whose window holds step t; inf
-    if no window does.
-    """
+    """The least rho of the children of formulas whose window holds step t, at each pose [N]; inf for none."""
     least = np.full(len(poses), np.inf)
     now = {name: values[-1:] for name, values in prefix.signals.items()}
     samples = prefix.task.samples(poses[:, None], now)

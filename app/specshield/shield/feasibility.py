@@ -139,9 +139,7 @@ def futures(
 def simulated(
     prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
 ) -> Futures:
-    """The futures of these motions, simulated and judged in one pass. rows: arrays [n, T - t] of motions,
-    which have been checked to be in range.
-    """
+    """The futures of motions, rows of arrays [n, T - t] that are in range: simulated and judged at once."""
     motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows])
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.tree.size))

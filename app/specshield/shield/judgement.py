@@ -25,9 +25,7 @@ from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
-# [steps] For V, ways with this much less slack are asked for too, and ways with more slack in steps of this
-# size (`_sooner`). Chosen by hand.
-LESS = 4
+LESS = 4  # [steps] V needs ways with that much less slack too, and between ways with more. Chosen by hand.
 
 
 class Situation(NamedTuple):
@@ -132,9 +130,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
 
 
 def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
-    """`kept` [N], with -inf for the futures that make a motion from where it led nowhere before. barred: see
-    `Care`.
-    """
+    """`kept` [N], with -inf for the futures that make a barred motion. barred: see `Care`."""
     # If no policy can avoid such motions, a future that makes one only later on still counts.
     whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
     goes = in_vain(barred, prefix.poses[-1], tried.motions, tried.poses, whole)
@@ -148,10 +144,9 @@ def _with_room(shield: Shield, prefix: Prefix, tried: Futures, kept: Floats) -> 
 
 
 def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[Sequence[int], bool]:
-    """For deadlines how many steps earlier the policies are asked for more ways, and whether they are asked
-    for each motion, or only for those that keep the rule without the margin and the slack.
-
-    most: the slack that was found so far. some: whether there are motions of the latter kind.
+    """By how many steps earlier deadlines the policies are asked for more ways; and whether they are asked
+    for each motion, or only for those that keep the rule without the slack that is asked for. most: the slack
+    found so far. some: whether there are motions of the latter kind.
     """
     unsure = shield.config.uncertainty is not None
     if unsure and shield.config.threshold_over == "episode":  # V weighs ways with any slack
@@ -214,9 +209,7 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
 def _by_action(
     motion_of: Ints, feasible: Bools, values: Floats, row: Ints, rho: Floats
 ) -> tuple[Bools, Floats, Floats]:
-    """`Judged.feasible`, `values` and `robustness`, each [A], from what is known of the motions: feasible,
-    values, row [M], and rho [N] of the futures.
-    """
+    """`Judged.feasible`, `values` and `robustness`, each [A], from those of motions [M] and futures [N]."""
     count = motion_of.shape[0]
     all_feasible, all_values = np.zeros(count, np.bool_), np.full(count, -np.inf)
     robustness = np.full(count, -np.inf)
@@ -286,8 +279,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
 
 @kernel
 def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
-    """Which motions keep the margin `asked` [m] or, if none does, have the largest margin; whether it was
-    lowered so.
+    """Which motions keep the margin `asked` [m], or else have the largest one; whether it was lowered so.
 
     robustness [M]: of each motion's best future.
     """
@@ -299,9 +291,7 @@ def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
 
 
 def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:
-    """Each motion's certified continuation: the motions that follow it, one a byte; None for a motion that is
-    not feasible.
-    """
+    """Each motion's certified continuation, one motion a byte; None for a motion that is not feasible."""
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
     motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()

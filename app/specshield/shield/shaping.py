@@ -55,9 +55,7 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
 
 @leaf
 def _wrong(logits: Floats) -> int:
-    """The index of the first logit that is NaN or +infinity; how many logits there are if all are -infinity;
-    else -1.
-    """
+    """The first logit that is NaN or +infinity, by index; their number if all are -infinity; else -1."""
     ruled_out = 0
     for i in range(logits.shape[0]):
         if math.isnan(logits[i]) or logits[i] == math.inf:
@@ -89,9 +87,7 @@ def conditional(log_prior: Floats, allowed: Bools) -> Floats | None:
 
 @kernel
 def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
-    """The whole distribution: `body` given that the model does not end, and the prior's own mass on terminal
-    actions. Shapes (A,).
-    """
+    """`body` given that the model does not end, and the prior's own mass on terminal actions. Shapes (A,)."""
     shares: Floats = (1.0 - ending) * body * ~terminal + np.exp(log_prior) * terminal
     return shares
 

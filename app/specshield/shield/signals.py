@@ -25,11 +25,8 @@ from specshield.stl import SATISFIED_ABOVE
 
 
 def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged, bool]:
-    """Judges the actions with the signals at their worst or, if no action is feasible then, with the signals
-    that keep their last values.
-
-    Returns the shield and the situation that were judged, what the futures say of each action, and whether
-    the signals were at their worst.
+    """Judges the actions with the signals at their worst or, if none is feasible then, at their last values.
+    Returns the shield and the situation, what was judged of them, and whether the signals were at worst.
     """
     if shield.config.any_signal and now.status == "pending":
         found = _judged_at_worst(shield, now)
@@ -61,9 +58,7 @@ def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | No
 
 
 def _judged_at_worst(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged] | None:
-    """The first three results of `judged_by_signals`, with the signals at their worst; None if no action is
-    feasible then. Proposers that have `foreseeing` plan for these signals.
-    """
+    """As `judged_by_signals`, with the signals at worst alone; None if no action is feasible then."""
     held = worst_signals(shield.task)
     if held is None:
         return None

@@ -77,9 +77,8 @@ def aim(
     aimed = _aim(shield, care, prefix, now, any_visit, np.zeros_like(asked))
     if True not in short.tolist():
         return aimed
-    # Places that were visited with less than the margin are visited again if that leaves as much margin, and
-    # half of the slack that is asked for, to all that is open beside them: all of these places or, if that is
-    # not possible, each of them for which it is.
+    # Places that were visited with less than the margin are visited again, all of them or else each of which
+    # that is possible with no less margin, and with half of the slack for all that is open beside it.
     places, half, robust = short.copy(), asked // 2, any_visit + care.margin
     for some in (places, *np.eye(size, dtype=np.bool_)[places]):
         tighter = _aim(shield, care, prefix, now, np.where(some, robust, aimed.visits), half)
@@ -166,8 +165,7 @@ def _best_asked(
 
 @kernel
 def _best_open(now: Open, early: Ints, margin: float) -> tuple[Best, bool]:
-    """The best future of each motion, by rho of the open conjuncts with slack `early` (K,), and whether one
-    of these is above `margin`.
+    """The best future of each motion, by the conjuncts that are open, and whether some rho is above `margin`.
 
     The way that the robot is on stays the best future of its motion if it is above the margin, even if
     another future is more robust: a robot that changes to a better way at each step may never arrive.

@@ -68,8 +68,7 @@ def learn(
 ) -> tuple[Seen | None, Care]:
     """What has been seen up to x_t, and what J asks for because of it. poses [t + 1, 3].
 
-    contact: whether the last motion met something, or led on where f has it stopped. Such a motion does not
-    count.
+    contact: the last motion met something, or led on where f has it stopped, and does not count.
     """
     config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
     if known is None:
@@ -228,13 +227,11 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
 def _weighed(
     body: Body, beside: bool, told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floats
 ) -> tuple[Seen, Noise]:
-    """`observe`, and the noise that follows. beside: whether slips beside an obstacle do not count, since
-    the robot may have met it.
-    """
+    """`observe`, and the noise after it. beside: whether steps beside obstacles do not count for slips."""
     found, near = observe(told, seen, before, foreseen, pose), body.radius + BESIDE
     u, v = centre(body, before[0], before[1], before[2])
     if beside and found.moved > seen.moved and near - free_distance(body, u, v, near) > TOUCH:
-        # Neither motions that were executed there nor those that were not tell how often motions slip.
+        # The obstacle may be why a motion was not executed there, so neither this nor success counts.
         found = Seen(seen.moved, seen.lost, seen.odds, *found[3:])
     return found, noise_of(told, found)
 

@@ -7,9 +7,8 @@ V(a) is a lower bound on the probability of keeping the rule after a, V* the lar
 If V(a) is never above the expected V* of the next step, then E[d_{t+1}] >= d_t, and d_t <= V*_t; so the rule
 is kept with probability delta or more. In an exact world V is J, 0 or 1.
 
-If motions differ from f, V(a) is the probability that the best future after a is in time, and within its
-margin, in spite of what slips and noise cost (docs/uncertainty.md): a lower bound with slips alone, an
-estimate with noise.
+If motions differ from f, V(a) is the probability that the best future after a withstands slips and noise
+(docs/uncertainty.md): a lower bound with slips alone, an estimate with noise.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ def _chances(
     wait: int,
     values: Floats,
 ) -> None:
-    """Raises V of each motion, values (M,), which is 0 at first, to that of its best future. still (K,): the
-    conjuncts that are open; leaves (N, size), rho (N,), motions (N, T - t): of the futures.
-    """
+    """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open."""
     count, spread = still.shape[0], spread_of(noise, stride)
     sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
@@ -195,9 +192,7 @@ def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float
 
 
 def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools) -> float:
-    """d_{t+1} / V*_{t+1} = d_t / E_pi_t[V]. left: d_t / V*_t. values, distribution [A]: V and pi_t; in place
-    of a terminal action the best motion is executed.
-    """
+    """d_{t+1} / V*_{t+1}; left: d_t / V*_t. In place of a terminal action the best one is executed."""
     best = float(values.max())
     expected = float(inner(distribution, np.where(terminal, best, values)))
     if best <= 0.0 or expected <= 0.0:

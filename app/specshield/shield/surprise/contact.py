@@ -161,9 +161,7 @@ def cells_under(body: Body, pose: Floats, deep: float) -> Ints:
 
 
 def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floats]:
-    """The cells within `beyond` [m] of the footprint, how far each is from it [m], and in which direction
-    from its centre [rad].
-    """
+    """The cells within `beyond` [m] of the footprint, how far they are from it [m], and where [rad]."""
     h, (u, v) = body.resolution, centre(body, *pose)
     reach = body.radius + beyond + h
     height, width = body.occupied.shape
@@ -180,9 +178,7 @@ def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floa
 
 @kernel
 def _gaps(body: Body, cells: Ints, poses: Floats) -> Floats:
-    """How far each cell [n] is from the footprint at the nearest of the poses [m, 3], in metres; below 0 if
-    the footprint overlaps it.
-    """
+    """How far each cell [n] is from the footprint at the nearest of poses [m, 3]; below 0: overlapped."""
     h, width = body.resolution, body.occupied.shape[1]
     gap = np.full(cells.shape[0], np.inf)
     for pose in poses:
