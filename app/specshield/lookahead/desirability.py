@@ -143,9 +143,7 @@ def _back(
 
 @kernel
 def _mix(a: Singles, b: Singles, part: np.float32, out: Singles) -> None:
-    """As `_blend`, between two. part: the share of b. Most motions turn, and this takes two thirds of the
-    time of `_blend`.
-    """
+    """As `_blend`, between two, in two thirds of the time: most motions turn. part: the share of b."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for c in range(out.shape[0]):
         va, vb = one - part if a[c] < UNKEEPABLE else zero, part if b[c] < UNKEEPABLE else zero

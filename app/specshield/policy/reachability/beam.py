@@ -302,11 +302,8 @@ def _place(new: Poses, found: int, table: Int32s) -> int:
 
 @leaf
 def _rounded(poses: Floats, i: int) -> tuple[int, int, int]:
-    return (
-        math.floor(POSE_GRAIN * poses[i, 0] + 0.5),
-        math.floor(POSE_GRAIN * poses[i, 1] + 0.5),
-        math.floor(POSE_GRAIN * poses[i, 2] + 0.5),
-    )
+    x, y, theta = POSE_GRAIN * poses[i, 0], POSE_GRAIN * poses[i, 1], POSE_GRAIN * poses[i, 2]
+    return math.floor(x + 0.5), math.floor(y + 0.5), math.floor(theta + 0.5)
 
 
 @leaf

@@ -104,10 +104,9 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
 
 
 def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
-    """The guide for deadlines that come `early` steps earlier, and whether any deadline does come earlier.
-
-    They are those of every F that is open at step t and can still be met so early. A window keeps at least
-    half its length. For a robot that cannot wait, no deadline comes earlier.
+    """The guide for deadlines that come `early` steps earlier, and whether any does: those of each F that is
+    open at step t and can still be met so early. A window keeps at least half its length. For a robot that
+    cannot wait, no deadline comes earlier.
     """
     if guide.wait < 0:
         return guide, False
@@ -118,9 +117,7 @@ def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
 
 @kernel
 def _hasten(rules: Rules, early: int, past: Past, b: Ints, c1: Ints) -> tuple[int, bool]:
-    """Brings the ends b, c1 (K,) forward as `hurried` says; returns the least change [steps] among the open
-    F, and whether any end changed.
-    """
+    """Brings the ends b, c1 (K,) of open F forward; the least change [steps], and whether there is any."""
     now = recall(rules, past)
     least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):

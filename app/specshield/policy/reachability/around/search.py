@@ -275,8 +275,5 @@ def _slot_of(tree: Tree, i: int) -> int:
 
 @leaf
 def _rounded(pose: Floats, i: int) -> tuple[int, int, int]:
-    return (
-        math.floor(PLACE_GRAIN * pose[i, 0]),
-        math.floor(PLACE_GRAIN * pose[i, 1]),
-        math.floor(HEADING_GRAIN * pose[i, 2] + 0.5),
-    )
+    x, y, h = PLACE_GRAIN * pose[i, 0], PLACE_GRAIN * pose[i, 1], HEADING_GRAIN * pose[i, 2]
+    return math.floor(x), math.floor(y), math.floor(h + 0.5)
