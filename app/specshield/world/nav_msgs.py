@@ -33,7 +33,7 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
         values = np.array(data)
     except (ValueError, OverflowError):
         values = np.array(None)
-    whole = values.dtype.kind == "i" and values.ndim == 1
+    whole = values.dtype.kind == "i" and values.ndim == 1 and bool not in set(map(type, data))
     if whole:
         wrong = (values < UNKNOWN) | (values > 100)
     else:
