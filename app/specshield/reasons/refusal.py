@@ -18,7 +18,8 @@ from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.episode import Signals, check_switch, start
+from specshield.shield.episode import check_switch, start
+from specshield.shield.feasibility import Signals
 from specshield.shield.taught import on_map, teach
 from specshield.world.learned import SENT, forget
 
@@ -33,7 +34,7 @@ class Refusal:
     message: str
     proved: bool
     conjuncts: tuple[Conjunct, ...]
-    way: bytes | None = None  # as `Relaxed` has it
+    way: bytes | None = None  # see `Relaxed`
 
     @property
     def details(self) -> dict[str, Any]:

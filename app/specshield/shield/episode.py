@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from itertools import accumulate
 
@@ -25,7 +25,7 @@ from specshield.shield.answer import answer_of, unmodified
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.caution.threshold import chances, left_of, next_left
 from specshield.shield.decision import Carry, Config, Decision, Explanation, Shield, make_shield
-from specshield.shield.feasibility import Prefix, futures, prefix_of
+from specshield.shield.feasibility import Prefix, Signals, futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
     Situation,
@@ -44,7 +44,6 @@ from specshield.stl.robustness import verdict_between
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 
-Signals = Mapping[str, Floats]
 Explainer = Callable[[Shield, Prefix, Judged | None, Bools], tuple[Explanation | None, ...]]
 
 
