@@ -9,10 +9,7 @@ it all. With p the progress, which also counts the steps of a dwell, backward ov
 valid: free, and the `always` of the step hold. B is one bit. Between the lattice's crossings it is what valid
 corners of more than half of the weight say. A move against an obstacle may be how such a robot stands still.
 
-The planner takes such robots too, but finds less. Of the pairs (history, motion) after which some future
-keeps the rule, in small worlds where every future can be tried, these tables certify all 1,854. The planner
-certifies 695 of 695 for a robot that turns by 90 degrees on the spot, 496 of 511 for one that turns by 30,
-and 569 of 648 for one that turns on arcs (python -m benchmarks.restless).
+The planner takes such robots too, but finds less (docs/decisions.md).
 """
 
 from __future__ import annotations
