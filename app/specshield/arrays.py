@@ -20,8 +20,8 @@ Kind = TypeVar("Kind", bound=np.generic)
 
 
 def pooled(array: NDArray[Kind], join: np.ufunc, reach: int, axis: int, mode: Any = "edge") -> NDArray[Kind]:
-    """What `join` makes of the values at most `reach` places away along an axis. mode: what lies beyond its
-    ends, as numpy.pad has it. scipy.ndimage has the like, and takes 0.2 s to import.
+    """`join` (a ufunc such as minimum) of the values at most `reach` places away along an axis. mode: of
+    numpy.pad, for what lies beyond its ends. scipy.ndimage has such filters, but takes 0.2 s to import.
     """
     sides = [(reach, reach) if a == axis else (0, 0) for a in range(array.ndim)]
     windows = sliding_window_view(np.pad(array, sides, mode), 2 * reach + 1, axis)

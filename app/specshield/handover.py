@@ -18,7 +18,7 @@ NEVER = -2  # the step of a decision that no other follows: nothing is compared 
 
 
 def begun(way: bytes | None) -> Carry | None:
-    """What a session begins with. way: as `Carry` has it."""
+    """What the first decision of a session is given. way: see `Carry`."""
     return None if way is None else Carry(NEVER, np.empty((0, 3)), (), way=way)
 
 

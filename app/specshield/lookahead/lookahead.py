@@ -152,7 +152,7 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals = make_goals(body, task.grid)
     if len(goals.distance) == 0:
-        told = "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going"
+        told = "look-ahead needs places where the robot can turn freely, and this map has none"
         expected = "'projection'"
         raise Unsupported(told, path="shaping", got="lookahead", expected=expected)
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)

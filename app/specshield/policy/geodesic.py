@@ -97,8 +97,8 @@ def _upwind(distance: Floats, done: Bools, i: int, j: int) -> float:
 
 
 def falling(onward: Floats, off: Floats, resolution: float) -> Floats:
-    """A height [height, width] that falls along the way to a goal: the distance `onward` to it through roomy
-    space; beside an obstacle, where that is inf, higher by the distance `off` to where it is finite.
+    """A field [height, width] that falls along the way to a goal: the distance `onward` to it through roomy
+    space; beside obstacles, where that is inf, above all of these by the distance `off` to that space.
     """
     reached = np.isfinite(onward)
     return np.where(reached, onward, onward[reached].max(initial=0.0) + resolution + off)
@@ -106,7 +106,9 @@ def falling(onward: Floats, off: Floats, resolution: float) -> Floats:
 
 @kernel
 def downhill(height: Floats, steps: int) -> Ints:
-    """The cell, row * width + column, so many steps down the steepest way from each. [height * width]."""
+    """The cell, row * width + column, that lies so many steps down the steepest way from each cell. Shape
+    [height * width].
+    """
     rows, columns = height.shape
     after = np.empty(rows * columns, np.int64)
     for j in range(rows):

@@ -176,11 +176,9 @@ def _in_time(
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Judged:
-    """`judged` without the motions that are `doubtful` [M].
-
-    If no other motion is feasible, only those that are also `risky` [M] are left out. If that leaves none
-    either, the motions that keep the rule with less margin and slack and are not doubtful are feasible
-    instead. If there are none of these, nothing is left out.
+    """`judged` without the `doubtful` motions [M] or, if no other is feasible, without those of them that are
+    `risky` [M]. If that leaves none either, the motions that are not doubtful and keep the rule with less
+    margin and slack become feasible instead, if there are any.
     """
     if True not in doubtful.tolist():
         return judged

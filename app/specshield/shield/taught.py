@@ -61,7 +61,6 @@ SAME_PLACE = 1e-6  # [m] poses this near differ by rounding alone
 KEPT = 64  # bodies on learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 HEAD = struct.Struct("<h?hB3f")  # the fields of `Followed`
 MOST_MET = 255  # contacts at one pose that HEAD can hold
-NEVER_DRAWN = Followed()
 
 
 class Taught(NamedTuple):
@@ -76,7 +75,7 @@ class Taught(NamedTuple):
     """
 
     map: LearnedMap = NONE
-    followed: Followed = NEVER_DRAWN
+    followed: Followed = Followed()
     contact: bool = False
     stuck: tuple[Stuck, ...] = ()
     near: Near = NEAR

@@ -47,9 +47,8 @@ class LearnedMap:
     @cached_property
     def digest(self) -> bytes:
         """A hash of the cells and whether they are occupied, whatever changed them and when."""
-        return blake2b(
-            self.cell.astype("<i8").tobytes() + np.packbits(self.occupied).tobytes(), digest_size=16
-        ).digest()
+        cells = self.cell.astype("<i8").tobytes() + np.packbits(self.occupied).tobytes()
+        return blake2b(cells, digest_size=16).digest()
 
     def to_bytes(self) -> bytes:
         if not self.revision:

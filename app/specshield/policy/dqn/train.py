@@ -98,7 +98,7 @@ def make_q_network(inputs: int, units: int, outputs: int) -> nn.Sequential:
 
 
 def weights_of(network: nn.Module) -> dict[str, Singles]:
-    """A copy of the weights as network.py has them: w [inputs, outputs]."""
+    """A copy of the weights in the form of network.py: w [inputs, outputs]."""
     arrays = [parameter.detach().cpu().numpy().T.copy() for parameter in network.parameters()]
     return dict(zip(NAMES, arrays, strict=True))
 

@@ -42,7 +42,7 @@ class World(NamedTuple):
 
 
 class Way(NamedTuple):
-    """A way from x_t to the horizon, written motion by motion, and scratch for those who write it.
+    """A way from x_t to the horizon, which is written motion by motion, and scratch arrays for that.
 
     t: the step of x_t. motions (T - t,); poses (T - t + 1, 3), beginning with x_t; known (size,): all leaves
     along the way. rho (P,): the predicates at the pose read last; held (l,): the leaves that read signals

@@ -26,7 +26,7 @@ WIDE = "wide_"  # begins the names of the arrays of the tables for ways with roo
 
 
 def stored(tables: Tables, wide: Tables | None, narrow: Bools, asked: float) -> bytes:
-    """The file. wide, narrow [K] as a policy has them; asked: the pitch that its options ask for [m]."""
+    """The file. wide, narrow [K]: of the policy; asked: the pitch that its options ask for [m]."""
     names = ("cell", "bits") if len(tables.bits) else ("cell", "code", "table")
     tensors: Tensors = {name: getattr(tables, name) for name in names}
     if wide is not None:
