@@ -21,7 +21,7 @@ from specshield.reasons.lateness import driven, late_by, later, may_be_late, val
 from specshield.reasons.needs import Alternatives, Need, Reader
 from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
-from specshield.rule.residual import joined
+from specshield.rule.residual import all_of
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import futures, prefix_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
@@ -169,7 +169,7 @@ def _gather(gathered: _Gathered) -> None:
             if timed[i]:
                 look_for(reader.alternatives(shield.task.formula), each[i])
             else:
-                look_for(reader.alternatives(joined([other for other in parts if other != parts[i]])))
+                look_for(reader.alternatives(all_of([other for other in parts if other != parts[i]])))
 
 
 def _found(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.rule.residual import joined
+from specshield.rule.residual import all_of
 from specshield.rule.view import look, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 from specshield.task import Task
@@ -26,7 +26,7 @@ def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats) -> For
                 kept.append(Always(max(a, min(t + 1 - child.horizon, b)), b, child))
             case _:
                 kept.append(conjunct)
-    return joined(kept) if kept else formula
+    return all_of(kept) if kept else formula
 
 
 def bounds_after(task: Task, formula: Formula, poses: Floats, rows: Floats) -> tuple[float, float]:

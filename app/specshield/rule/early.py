@@ -15,7 +15,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
-from specshield.rule.residual import joined
+from specshield.rule.residual import all_of
 from specshield.rule.values import places
 from specshield.rule.view import View, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
@@ -57,7 +57,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
     """The formula's conjuncts, and the view that has their leaves; None if that is the formula's own view."""
     above = (formula,) if is_predicate(formula) else conjuncts(formula)  # as in the tree
     above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
-    whole, slots = joined(above), places(task)
+    whole, slots = all_of(above), places(task)
     tree = compile_tree(whole, slots, True)
     rows, kept, size = list[tuple[int, ...]](), list[bool](), 0
     owner, seeker = list[int](), list[int]()

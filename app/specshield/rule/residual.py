@@ -29,5 +29,6 @@ def again(broken: Sequence[Always], t: int, early: int = 0) -> list[Formula]:
     return [Always(min(a, each.b), each.b, each.child) for a, each in ways if each.horizon >= t]
 
 
-def joined(parts: Sequence[Formula]) -> Formula:
+def all_of(parts: Sequence[Formula]) -> Formula:
+    """The conjunction of at least one formula."""
     return parts[0] if len(parts) == 1 else And(tuple(parts))

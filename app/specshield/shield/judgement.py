@@ -14,7 +14,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.robot.barred import in_vain
 from specshield.robot.room import has_room, widened
-from specshield.rule.residual import again, joined, left_over
+from specshield.rule.residual import again, all_of, left_over
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, holding, is_place
@@ -248,7 +248,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     guards = [each for each in guards if is_place(task, each)]
 
     def keeps(parts: list[Formula]) -> bool:
-        return bool(rho_of(prefix.of(joined(parts)), tried.poses)[0].max() > SATISFIED_ABOVE)
+        return bool(rho_of(prefix.of(all_of(parts)), tried.poses)[0].max() > SATISFIED_ABOVE)
 
     def options() -> Iterator[list[Formula]]:
         nonlocal tried
@@ -272,7 +272,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     for left in filter(None, options()):
         if keeps(left):
             break
-    return tried, prefix.of(joined(left)) if left else prefix
+    return tried, prefix.of(all_of(left)) if left else prefix
 
 
 @kernel

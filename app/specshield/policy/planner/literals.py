@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Ints
-from specshield.rule.residual import joined
+from specshield.rule.residual import all_of
 from specshield.rule.view import View, view_of
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until, conjuncts
 from specshield.stl.conjunction import is_predicate, signed
@@ -122,7 +122,7 @@ def released(formula: Formula) -> Formula:
                 neither = And((signed(p, True), signed(q, True)))
                 kept = Or((Always(0, b - a, Not(q)), Until(0, b - a, Not(q), neither)))
                 said[i] = Or((Eventually(0, a - 1, Not(p)), Eventually(a, a, kept))) if a else kept
-    return formula if said == [*parts] else joined(said)
+    return formula if said == [*parts] else all_of(said)
 
 
 def leading(literal: Literal) -> tuple[Formula, int]:

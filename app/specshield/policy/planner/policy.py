@@ -43,7 +43,7 @@ from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
-from specshield.rule.residual import joined as all_of
+from specshield.rule.residual import all_of
 from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals

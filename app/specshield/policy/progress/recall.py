@@ -10,7 +10,7 @@ from typing import NamedTuple
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
-from specshield.rule.residual import again, joined, left_over
+from specshield.rule.residual import again, all_of, left_over
 from specshield.stl import Formula
 
 
@@ -103,6 +103,6 @@ def residuals(formula: Formula, prefix: Mapping[str, Floats], t: int) -> Iterato
     """
     kept, broken = left_over(formula, prefix, t)
     if broken:
-        yield joined([*kept, *again(broken, t + 1)])
+        yield all_of([*kept, *again(broken, t + 1)])
     if kept:
-        yield joined(kept)
+        yield all_of(kept)
