@@ -131,7 +131,7 @@ def teach(
             # Slips come in a row; what does nothing, and again once the robot is back, did not slip.
             stuck = led_nowhere(stuck, poses[-1], max(motion, followed.halted), near)
         elif followed.halted >= 0 and followed is not before.followed:
-            stuck = did_nothing(stuck, poses[-1], followed.halted, near)
+            stuck = did_nothing(stuck, poses[-1], followed.halted)
         elif on >= 0:  # f was wrong there: a way that relies on it again may lead round in a circle
             stuck = led_nowhere(stuck, poses[-2], on, near)
         elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):

@@ -34,7 +34,7 @@ def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -
     return _newest((*worked(stuck, pose, motion, near), (*pose.tolist(), motion)))
 
 
-def did_nothing(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
+def did_nothing(stuck: Iterable[Stuck], pose: Floats, motion: int) -> tuple[Stuck, ...]:
     """`stuck`, and that a motion did nothing at a pose (3,), but may only have slipped."""
     return _newest((*stuck, (*pose.tolist(), ~motion)))
 
