@@ -44,8 +44,3 @@ def side_of(grid: OccupancyGrid | Body, pitch: float) -> tuple[int, int]:
     """Rows and columns of a lattice on a map."""
     ny, nx = (max(math.ceil(n * grid.resolution / pitch - 1e-9), 1) for n in grid.occupied.shape)
     return ny, nx
-
-
-def lattice_shape(task: Task, pitch: float) -> tuple[int, int, int]:
-    """Rows, columns and headings of the lattice for a task."""
-    return (*side_of(task.grid, pitch), headings_of(task))

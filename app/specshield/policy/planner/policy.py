@@ -38,7 +38,7 @@ from specshield.policy.progress.recall import residuals
 from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.reachability.stored import check_fit
-from specshield.policy.shape import lattice_shape, side_of
+from specshield.policy.shape import headings_of, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
@@ -290,7 +290,7 @@ def _pitch(task: Task, settings: Settings) -> float:
     fields = max(1, min(2 * len(literals), MAX_FIELDS))
     pitch = fitting_pitch(task, settings.pitch, fields, MAX_ENTRIES)
     if pitch > COARSEST * settings.pitch:
-        ny, nx, headings = lattice_shape(task, settings.pitch)
+        (ny, nx), headings = side_of(task.grid, settings.pitch), headings_of(task)
         got = f"{fields} fields of {ny} x {nx} x {headings} poses"
         least = math.ceil(100.0 * pitch / COARSEST) / 100.0
         would = f"options.pitch {least:.2f} or more, or fewer predicates"

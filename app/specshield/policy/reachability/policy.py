@@ -35,7 +35,7 @@ from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import Guide, Tables
-from specshield.policy.shape import lattice_shape
+from specshield.policy.shape import headings_of, side_of
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.robot.room import widened
@@ -281,8 +281,8 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
         entries, most = (task.horizon + 1) * -(-state_count(rules) // 8), MAX_BYTES
     else:
         entries, most = len(masks_of(rules)) * len(phases_of(rules, task.horizon)), MAX_ENTRIES
-    ny, nx, headings = lattice_shape(task, settings.pitch / 3.0)
-    if ny * nx * headings * entries <= FINE_ENTRIES:
+    ny, nx = side_of(task.grid, settings.pitch / 3.0)
+    if ny * nx * headings_of(task) * entries <= FINE_ENTRIES:
         return settings.pitch / 3.0, None
     pitch = fitting_pitch(task, settings.pitch, entries, most)
     if pitch == settings.pitch:
