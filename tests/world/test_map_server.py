@@ -220,7 +220,7 @@ def test_an_occupancy_grid_message():
         (message(), [0, 0.5, 0, 0, 0, 0], "data[1]"),
         (message(), [0, [0], 0, 0, 0, 0], "data[1]"),
         (message(), [0, None, 0, 0, 0, 0], "data[1]"),
-        (message(), [0, 100, True, 0, 0, 0], "data[2]"),  # numpy makes 1 of it among whole numbers
+        (message(), [0, 100, True, 0, 0, 0], "data[2]"),
         (message(), [0, 10**30, 0, 0, 0, 0], "data[1]"),
         (message(width=4001), [0], "info.width"),
         (message(height=0), [], "info.height"),

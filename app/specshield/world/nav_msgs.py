@@ -29,19 +29,10 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
     )
     yaw = _yaw(checks.member(origin, "orientation", "info.origin"))
     checks.items(data, "data", width * height, width * height)
-    try:
-        values = np.array(data)
-    except (ValueError, OverflowError):
-        values = np.array(None)
-    whole = values.dtype.kind == "i" and values.ndim == 1 and bool not in set(map(type, data))
-    if whole:
-        wrong = (values < UNKNOWN) | (values > 100)
-    else:
-        wrong = np.array([type(value) is not int or abs(value) > 100 for value in data])
-    if not whole or wrong.any():
-        i = int(np.argmax(wrong))
+    if set(map(type, data)) != {int} or not UNKNOWN <= min(data) <= max(data) <= 100:
+        i = next(i for i, v in enumerate(data) if type(v) is not int or not UNKNOWN <= v <= 100)
         raise checks.wrong("occupancy", f"data[{i}]", data[i], "an integer from -1 (unknown) to 100")
-    return from_values(values.reshape(height, width), resolution, (x, y, yaw))
+    return from_values(np.array(data).reshape(height, width), resolution, (x, y, yaw))
 
 
 def _yaw(orientation: Any) -> float:
