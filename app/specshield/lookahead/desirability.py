@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bytes, Codes, Ints, Singles
+from specshield.arrays import Bytes, Codes, Ints, Singles, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.lattice import Planes
 from specshield.lookahead.surrogate import StandIn
@@ -86,8 +86,7 @@ def _gather(planes: Planes, t: int, mask: int, following: Singles, left: Singles
     due, opened, last = planes.due[t], planes.open[t] & ~mask, following.shape[0] - 1
     for h in range(ahead.shape[0]):
         row, plain = ahead[h], following[mask, h]
-        for c in range(row.shape[0]):
-            row[c] = plain[c]
+        copy_row(plain, row)
         if due == 0 and opened == 0:
             continue
         holds, keeps = planes.holds[h], planes.keeps[h]

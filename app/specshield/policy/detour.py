@@ -6,7 +6,7 @@ Near a wall many motions end in the same pose. Arcs of one length end in the sam
 
 from __future__ import annotations
 
-from specshield.arrays import Floats, Ints
+from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import leaf
 from specshield.policy.undo import IMPOSSIBLE, turn_by
 from specshield.robot.dynamics import Body, wrap
@@ -32,10 +32,9 @@ def copy_ways(motions: Ints, poses: Floats, twin: Ints) -> None:
     """Copies to each motion what follows its twin (M,). motions (M, n), poses (M, n, 3)."""
     for m in range(twin.shape[0]):
         if twin[m] != m:
+            copy_row(motions[twin[m], 1:], motions[m, 1:])
             for i in range(1, motions.shape[1]):
-                motions[m, i] = motions[twin[m], i]
-                for k in range(3):
-                    poses[m, i, k] = poses[twin[m], i, k]
+                copy_row(poses[twin[m], i], poses[m, i])
 
 
 @leaf

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.arrays import Singles
+from specshield.arrays import Singles, copy_row
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import PolicyError
 
@@ -84,8 +84,7 @@ def greedy(net: Network, observation: Singles, layers: Layers) -> int:
 @inlined
 def _layer(x: Singles, w: Singles, b: Singles, out: Singles) -> None:
     """out = b + x w, each sum in the inputs' order; eight inputs a pass, so that sums stay in registers."""
-    for j in range(out.shape[0]):
-        out[j] = b[j]
+    copy_row(b, out)
     whole = x.shape[0] - x.shape[0] % 8
     for i in range(0, whole, 8):
         x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]

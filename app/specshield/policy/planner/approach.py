@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.arrays import Floats, Ints
+from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.planner.due_dates import read_pose
@@ -110,8 +110,7 @@ def descend_by_beam(
     k holds, after `shortest` to `longest` steps. The other arguments and the result are those of `descend`.
     """
     body, places, trail = world.body, way.places, way.trail
-    for c in range(3):
-        places[0, 0, c] = way.poses[n, c]
+    copy_row(way.poses[n], places[0, 0])
     trail[0, 0, 1] = -1
     count = 1
     for i in range(1, min(longest, stop - n) + 1):
@@ -170,9 +169,8 @@ def _insert(
             return kept
     at = min(kept, BEAM_WIDTH - 1)
     while at > 0 and places[at - 1, 3] > ahead:
-        for c in range(4):
-            places[at, c] = places[at - 1, c]
-        trail[at, 0], trail[at, 1] = trail[at - 1, 0], trail[at - 1, 1]
+        copy_row(places[at - 1], places[at])
+        copy_row(trail[at - 1], trail[at])
         at -= 1
     places[at, 0], places[at, 1], places[at, 2], places[at, 3] = x, y, theta, ahead
     trail[at, 0], trail[at, 1] = parent, motion

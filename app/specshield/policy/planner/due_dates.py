@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Floats
+from specshield.arrays import Floats, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.literals import LAST, PREDICATE, SIDE, PackedLiterals
 from specshield.policy.progress.values import fill_place
@@ -101,8 +101,8 @@ def is_open_if(
 
 @leaf
 def _reset(bounds: Bounds) -> None:
-    for i in range(bounds.low.shape[0]):
-        bounds.trial_low[i], bounds.trial_high[i] = bounds.low[i], bounds.high[i]
+    copy_row(bounds.low, bounds.trial_low)
+    copy_row(bounds.high, bounds.trial_high)
 
 
 @leaf

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from specshield.arrays import Ints
+from specshield.arrays import Ints, copy_row
 from specshield.compiled import inlined, leaf
 from specshield.policy.planner.approach import BEAM_LENGTH, descend, descend_by_beam, linger
 from specshield.policy.planner.due_dates import NO_DATE, due_date, foresee, is_open, needed_until, stay_for
@@ -66,8 +66,7 @@ class Nodes(NamedTuple):
 @leaf
 def value(world: World, way: Way) -> float:
     """rho of a way that is complete."""
-    for i in range(way.buffer.shape[0]):
-        way.buffer[i] = way.known[i]
+    copy_row(way.known, way.buffer)
     way.spent[0] += world.cost
     return tree_value(world.literals.formula.tree, way.buffer)
 
@@ -86,8 +85,7 @@ def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, 
         return
     nodes.state[d, COUNT] += 1
     while i > nodes.state[d, TRIED] and child[d, i - 1, KEY] > key:
-        for c in range(child.shape[2]):
-            child[d, i, c] = child[d, i - 1, c]
+        copy_row(child[d, i - 1], child[d, i])
         i -= 1
     child[d, i, KEY], child[d, i, LITERAL], child[d, i, BEFORE] = key, literal, before
     child[d, i, STAY], child[d, i, KEEP] = stays, keep

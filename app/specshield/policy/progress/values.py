@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.arrays import Floats
+from specshield.arrays import Floats, copy_row
 from specshield.compiled import inlined
 from specshield.rule.values import REGIONS, fill_pose, fill_region
 from specshield.task import Task
@@ -27,6 +27,4 @@ def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values:
 @inlined
 def fill_signals(regions: PackedRegions, signals: Floats, values: Floats) -> None:
     """signals (S,)."""
-    first = REGIONS + regions.plain.shape[0]
-    for s in range(signals.shape[0]):
-        values[first + s] = signals[s]
+    copy_row(signals, values[REGIONS + regions.plain.shape[0] :])

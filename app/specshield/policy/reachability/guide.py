@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.arrays import Floats, Int8s, Ints
+from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Corners
 from specshield.policy.progress import (
@@ -99,8 +99,7 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
     """Writes waits from motions[n], n >= 1, to the horizon, at the pose that motions[:n] led to."""
     for rest in range(n, motions.shape[0]):
         motions[rest] = wait
-        for c in range(3):
-            poses[rest, c] = poses[n - 1, c]
+        copy_row(poses[n - 1], poses[rest])
 
 
 def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
