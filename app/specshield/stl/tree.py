@@ -32,9 +32,9 @@ class Tree(NamedTuple):
     [n]: the step of its first value. turned [n]: whether it stands below an odd number of `not`.
 
     leaf_at [l]: where a leaf's values begin in the buffer. leaf_start, leaf_stop [l]: the steps of its
-    values, `leaf_stop` excluded. sought [l]: 1 for the operand of an F, or the right side of an U, below an
-    even number of `not`; else 0. low, high [l]: bounds on its value at a step still to come. size: of the
-    buffer.
+    values, `leaf_stop` excluded. sought [l]: 1 if, once `not` is moved inwards, an F or the right side of an
+    U asks the leaf to be true; else 0. low, high [l]: bounds on its value at a step still to come. size: of
+    the buffer.
     """
 
     op: Ints

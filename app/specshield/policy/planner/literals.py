@@ -112,8 +112,8 @@ def separate(task: Task, formula: Formula) -> Formula:
 
 def released(formula: Formula) -> Formula:
     """A formula of the same robustness, in which a conjunct `not (p U[a,b] q)` says that q fails throughout,
-    or up to a step at which p fails too. In the first form q is due to fail at the next step at each step, so
-    that plans would go on by single steps.
+    or up to a step at which p fails too. As it stands, q would be due to fail at every next step, and plans
+    would go on by single steps.
     """
     said = list(parts := conjuncts(formula))
     for i, part in enumerate(parts):

@@ -313,8 +313,8 @@ def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tup
 
 
 def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
-    """The literals that a way to a goal has to keep: in any case, and those beside them that may have to hold
-    for a while. The former have to hold, whatever else happens, at half of all steps or more.
+    """The literals that every way to a goal keeps; and these with those that may have to hold for a while.
+    The former have to hold, whatever else happens, at half of all steps or more.
     """
     size = packed.formula.tree.size
     bounds = make_bounds(size)
