@@ -249,7 +249,7 @@ def test_the_page_is_there_without_the_internet(server, tmp_path):
         text=True,
         timeout=HUNG,
     )
-    for shown in ("/v1/sessions/{session_id}/steps", "Decide one step", "Check a formula"):
+    for shown in ("/v1/sessions/{session_id}/steps", "Decide one step", "Check a formula", "Send a map"):
         assert shown in page.stdout.replace("​", ""), page.stderr[-2000:]
     drawn = np.asarray(Image.open(picture).convert("L"))
     assert (drawn < 128).mean() > 0.005  # text

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 
 import httpx
 
 from tests.browsing import needs_chromium
 from tests.service.world import START, policy_files
-from tests.serving import HUNG, free_port, serving, wait_for
+from tests.serving import free_port, serving, wait_for
 
 pytestmark = needs_chromium
 AWAY = "The server does not answer; trying again."
@@ -32,17 +33,15 @@ def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path, browse):
     and go on when it is back, where the keyboard was. Then the session is erased.
     """
     port, fleet = free_port(), [f"robot-of-the-warehouse-north-{n:04}" for n in range(1, 4)]
-    with browse() as (robots, complaints):
+    with ExitStack() as stack:
+        (robots, complaints), *shown = (stack.enter_context(browse()) for _ in range(4))
+        policies, session, floor = (page for page, _ in shown)
         with serving(tmp_path, port=port) as first:
             for id in fleet[:2]:
                 stand(first.url, id)
-            shown = []
-            for path in ("policies", f"sessions/{fleet[0]}", f"floor?sessions={','.join(fleet[:2])},nosuch"):
-                page = robots.context.browser.new_page()
-                page.set_default_timeout(1e3 * HUNG)
-                page.goto(f"{first.url}/#/{path}")
-                shown.append(page)
-            policies, session, floor = shown
+            policies.goto(f"{first.url}/#/policies")
+            session.goto(f"{first.url}/#/sessions/{fleet[0]}")
+            floor.goto(f"{first.url}/#/floor?sessions={','.join(fleet[:2])},nosuch")
             robots.goto(first.url)
             link = robots.get_by_role("link", name="-north-0001")
             link.focus()
