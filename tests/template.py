@@ -3,7 +3,8 @@
     python -m tests.template     # standard input is a socket from `tests.serving`
 
 A fork takes 10 ms, where a new interpreter needs a second or two of a processor until it serves. What a fork
-runs is the command line, `specshield.cli.main`, with arguments, environment and files of its own.
+runs is the command line, `specshield.cli.main`, with arguments, environment and files of its own. A server's
+process for heavy work is a fork too.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ import signal
 import socket
 import sys
 import tempfile
+from typing import Any
 
 from specshield import cli
+from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
 
 SERVER = (
     "uvicorn.protocols.http.httptools_impl",
     "specshield.service.app",
     "specshield.service.bounds.protocol",
+    "specshield.service.heavy.uploads",
 )
 EVALUATION = ("evaluation.plan", "scipy.stats")  # before the first command that needs them: a second
 
@@ -91,7 +95,56 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     sys.argv = ["specshield", *arguments]
     main_module = sys.modules["__main__"]
     main_module.__spec__ = main_module.__package__ = None  # which `python -m` has set
+    if arguments[:1] == ["serve"]:
+        prepared = Prepared()
+        heavy.Template = lambda: prepared  # type: ignore[assignment,misc]
     cli.main()
+
+
+class Prepared(pool.Template):
+    """Its process is forked before the server has threads. It waits for the server's first heavy work."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ours, theirs = socket.socketpair()
+        self._forked: Fork | None = Fork()
+        if self._forked.pid == 0:
+            self._ours.close()
+            os.setsid()
+            _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)  # none at the end of the server
+            theirs.close()
+            if descriptors:
+                child.template(socket.socket(fileno=descriptors[0]))
+            os._exit(0)
+        theirs.close()
+
+    def begin(self, control: socket.socket) -> Any:
+        forked, self._forked = self._forked, None
+        if forked is None:
+            return super().begin(control)
+        socket.send_fds(self._ours, [b"."], [control.fileno()])
+        return forked
+
+
+class Fork:
+    """It has of a Popen what the pool uses."""
+
+    def __init__(self) -> None:
+        self.pid = os.fork()
+        self._ended = False
+
+    def poll(self) -> int | None:
+        self._ended = self._ended or os.waitpid(self.pid, os.WNOHANG)[0] == self.pid
+        return 0 if self._ended else None
+
+    def kill(self) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self) -> None:
+        if not self._ended:
+            os.waitpid(self.pid, 0)
+            self._ended = True
 
 
 if __name__ == "__main__":

@@ -258,7 +258,7 @@ def test_a_server_that_stops_ends_a_stream_after_the_step_that_it_is_deciding(tm
             stream.send(json.dumps(body(0)))
             assert json.loads(stream.recv())["t"] == 0
             below = psutil.Process(server.process.pid).children(recursive=True)
-            planners = [each for each in below if "heavy.child" in command_line(each.pid)]
+            planners = [each for each in below if "tests.template" in command_line(each.pid)]  # forks of it
             assert planners
             for each in planners:
                 each.suspend()
