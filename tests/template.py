@@ -21,15 +21,33 @@ import sys
 import tempfile
 from typing import Any
 
+from PIL import Image
+
 from specshield import cli
 from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
 
 SERVER = (
+    "anyio._backends._asyncio",
+    "encodings.idna",
+    "uvicorn.lifespan.on",
+    "uvicorn.loops.auto",
+    "uvicorn.loops.uvloop",
     "uvicorn.protocols.http.httptools_impl",
     "specshield.service.app",
     "specshield.service.bounds.protocol",
     "specshield.service.heavy.uploads",
+)
+COMMANDS = (
+    "evaluation.commands",
+    "specshield.commands.check_drive",
+    "specshield.commands.doctor",
+    "specshield.commands.export",
+    "specshield.commands.policy",
+    "specshield.commands.run",
+    "specshield.commands.watch",
+    "specshield.service.access.commands",
+    "specshield.sim.demo",
 )
 EVALUATION = ("evaluation.plan", "scipy.stats")  # before the first command that needs them: a second
 
@@ -38,7 +56,8 @@ def main(control: socket.socket) -> None:
     """Forks for each socket that is sent, until the test's process has ended."""
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     gc.disable()  # `prepare` collects again
-    _import(SERVER)
+    _import(SERVER + COMMANDS)
+    Image.preinit()  # of Pillow, whose formats are imported with the first map
     asyncio.run(prepare(Startup()))
     gc.freeze()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the keepers
