@@ -49,8 +49,6 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     assert "shielded rule satisfied" in driven.stdout
     drawn = (tmp_path / "flat-run.svg").read_text()
     assert all(f'class="{kind}"' in drawn for kind in ("walls", "way", "beside", "target")), drawn
-    refused = run_specshield("run", "flat", "--shaping", "nope", "--out", tmp_path, **own)
-    assert refused.stderr.splitlines()[-1].startswith("unknown shaping; got 'nope'")
     refused = run_specshield("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)
     said = "--target: no robot can stand there; got '-1,-1'; expected a free place"
     assert refused.stderr.splitlines()[-1] == said
@@ -136,6 +134,7 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp
     [
         (("policy", "--map", "none.yaml", "--rule", "F[0,9] x > 1"), "--map: none.yaml cannot be read"),
         (("run", "case1", "--target", "2.5"), "--target: not a place"),
+        (("run", "case1", "--shaping", "nope"), "unknown shaping; got 'nope'; expected one of projection"),
     ],
 )
 def test_a_wrong_argument_is_told_before_a_server_is_started(asked, said, tmp_path):

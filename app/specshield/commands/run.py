@@ -24,6 +24,7 @@ def run_policy(
 ) -> None:
     """Drive a simulated robot through an episode, with and without the shield, and draw both."""
     from specshield.commands.serving import client_of
+    from specshield.lookahead.preferences import check_shaping
     from specshield.sim import picture
     from specshield.sim.campaign import begin
     from specshield.sim.episodes import with_shield, without_shield
@@ -31,8 +32,9 @@ def run_policy(
     from specshield.sim.progress import StatusLine
 
     out.mkdir(parents=True, exist_ok=True)
+    check_shaping(shaping)  # what is wrong is refused before a server is started
     if target is not None:
-        _target(target)  # what is no place is refused before a server is started
+        _target(target)
     status = StatusLine()
     with client_of(None, status) as client:
         found = client.policies.get(policy)
