@@ -27,9 +27,14 @@ SEED = 0
 
 
 @pytest.fixture(scope="module")
-def campaign(server, case):
+def several(server):
     with robots(server.url) as several:
-        yield run(several, case.name, RUNS, seed=SEED)
+        yield several
+
+
+@pytest.fixture(scope="module")
+def campaign(several, case):
+    return run(several, case.name, RUNS, seed=SEED)
 
 
 def test_an_interrupt_is_raised_between_two_results_and_not_while_they_are_made_or_waited_for():
@@ -110,9 +115,9 @@ def padded(episode, case):
     return episode.poses + [episode.poses[-1]] * (case.task.horizon + 1 - len(episode.poses))
 
 
-def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
-    with robots(server.url) as several:
-        again = run(several, case.name, 1, seed=SEED)
+def test_an_episode_is_decided_by_its_seed_alone(campaign, case, several):
+    """By processes that have driven other episodes since, of another case too."""
+    again = run(several, case.name, 1, seed=SEED)
     for name in ("shielded", "unshielded"):
         first, second = getattr(campaign, name)[0], getattr(again, name)[0]
         assert second.poses == first.poses
