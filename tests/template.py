@@ -19,7 +19,6 @@ import signal
 import socket
 import sys
 import tempfile
-from typing import Any
 
 from PIL import Image
 
@@ -115,34 +114,23 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     main_module = sys.modules["__main__"]
     main_module.__spec__ = main_module.__package__ = None  # which `python -m` has set
     if arguments[:1] == ["serve"]:
-        prepared = Prepared()
+        prepared = _prepared()
         heavy.Template = lambda: prepared  # type: ignore[assignment,misc]
     cli.main()
 
 
-class Prepared(pool.Template):
-    """Its process is forked before the server has threads. It waits for the server's first heavy work."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._ours, theirs = socket.socketpair()
-        self._forked: Fork | None = Fork()
-        if self._forked.pid == 0:
-            self._ours.close()
-            os.setsid()
-            _, descriptors, _, _ = socket.recv_fds(theirs, 1, 1)  # none at the end of the server
-            theirs.close()
-            if descriptors:
-                child.template(socket.socket(fileno=descriptors[0]))
-            os._exit(0)
-        theirs.close()
-
-    def begin(self, control: socket.socket) -> Any:
-        forked, self._forked = self._forked, None
-        if forked is None:
-            return super().begin(control)
-        socket.send_fds(self._ours, [b"."], [control.fileno()])
-        return forked
+def _prepared() -> pool.Template:
+    """One that has begun already: its process is forked while the server has no threads."""
+    prepared = pool.Template()
+    prepared._control, theirs = socket.socketpair()
+    prepared._process = Fork()  # type: ignore[assignment]
+    if prepared._process.pid == 0:
+        prepared._control.close()
+        os.setsid()
+        child.template(theirs)  # until the server has ended, if nothing is asked of it
+        os._exit(0)
+    theirs.close()
+    return prepared
 
 
 class Fork:

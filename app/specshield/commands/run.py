@@ -33,12 +33,11 @@ def run_policy(
 
     out.mkdir(parents=True, exist_ok=True)
     check_shaping(shaping)  # what is wrong is refused before a server is started
-    if target is not None:
-        _target(target)
+    place = None if target is None else _target(target)
     status = StatusLine()
     with client_of(None, status) as client:
         found = client.policies.get(policy)
-        case = _case(found.id, found.name or found.id[:12], target, seed)
+        case = _case(found.id, found.name or found.id[:12], place, seed)
         session, start, refused = begin(client, case, found.id, seed, shaping=shaping)
         status.say("driving ...")
         model = GoalSeeker(case.task.robot)
@@ -56,9 +55,9 @@ def run_policy(
     raise typer.Exit(0 if shielded.spec_status == "satisfied" else 1)
 
 
-def _case(id: str, name: str, target: str | None, seed: int) -> Case:
-    """The policy's task as the simulation takes it, from the data folder. target: "x,y" [m]; without it a
-    place drawn by `seed`.
+def _case(id: str, name: str, target: tuple[float, float] | None, seed: int) -> Case:
+    """The policy's task as the simulation takes it, from the data folder. target [m]: without it a place
+    drawn by `seed`.
     """
     import numpy as np
 
@@ -74,14 +73,12 @@ def _case(id: str, name: str, target: str | None, seed: int) -> Case:
     policies = Policies(settings, maps)
     about = policies.record(id).about
     task = policies.task(about)
-    if target is None:
-        drawn = free_poses(task, make_body(task.robot, task.grid), 1, np.random.default_rng([seed, 1]))
-        place = (float(drawn[0, 0]), float(drawn[0, 1]))
-    else:
-        place = _target(target)
+    drawn = free_poses(task, make_body(task.robot, task.grid), 1, np.random.default_rng([seed, 1]))
+    place = target or (float(drawn[0, 0]), float(drawn[0, 1]))
     case = Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
     if target is not None and (not task.grid.holds(place) or task.grid.occupied[case.cell(place)]):
-        raise InputError("no robot can stand there", path="--target", got=target, expected="a free place")
+        told = f"{place[0]:g},{place[1]:g}"
+        raise InputError("no robot can stand there", path="--target", got=told, expected="a free place")
     return case
 
 

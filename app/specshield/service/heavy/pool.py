@@ -42,21 +42,18 @@ class Template:
             self.stop()
             self._control, theirs = socket.socketpair()
             with theirs:
-                self._process = self.begin(theirs)
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "specshield.service.heavy.child"],
+                    stdin=theirs.fileno(),
+                    env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+                    start_new_session=True,
+                )
         assert self._control is not None
         ours, theirs = socket.socketpair()
         with theirs:
             socket.send_fds(self._control, [LIMITS.pack(memory, nice)], [theirs.fileno()])
         ours.setblocking(False)
         return ours
-
-    def begin(self, control: socket.socket) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, "-m", "specshield.service.heavy.child"],
-            stdin=control.fileno(),
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
-            start_new_session=True,
-        )
 
     def stop(self) -> None:
         if self._control is not None:
