@@ -25,6 +25,7 @@ from tests.stores import DURABLE, answers, running
 
 pytest.importorskip("torch")
 
+LEARNING = Path(__file__).parents[1] / "learning_example"
 TINY = {
     "updates": 20,
     "robots": 16,
@@ -35,6 +36,7 @@ TINY = {
     "replay": 1000,
 }
 LONG = {**TINY, "updates": 1_000_000, "evaluate_every": 1_000_000}
+SOON, LATER = ({"method": "patient", "options": {"steps": steps}} for steps in (1, 1_000_000))
 SPEC = {
     "formula": "F[0,6] Goal",
     "regions": {"Goal": {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}},
@@ -43,7 +45,10 @@ SPEC = {
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    with serving(tmp_path_factory.mktemp("training"), SPECSHIELD_WORKER="true") as server:
+    """With a method that learns as SOON or LATER as a test wants, and needs no time of the processor."""
+    path = os.pathsep.join([str(LEARNING), *filter(None, [os.environ.get("PYTHONPATH")])])
+    folder = tmp_path_factory.mktemp("training")
+    with serving(folder, SPECSHIELD_WORKER="true", PYTHONPATH=path) as server:
         yield server
 
 
@@ -119,7 +124,7 @@ def test_a_policy_is_computed_and_serves(client):
 
 
 def test_what_is_computed_does_not_wait_for_what_is_learned(client):
-    learned = ask(client, options=LONG, seed=5)
+    learned = ask(client, **LATER)
     reach(client, learned, "training")
     reach(client, ask(client, method="reachability", options={}, seed=6), "ready")
     assert read(client, learned)["status"] == "training"
@@ -153,24 +158,24 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
 
 def test_a_cancelled_run_ends_whatever_it_is_doing(server, client):
     """It may import, compile or compute for long and look at nothing else; here it stands still."""
-    policy = ask(client, options=LONG, seed=9)
+    policy = ask(client, **LATER, seed=9)
     reach(client, policy, "training")
     (run,) = children(learner_of(server))
     os.kill(run, signal.SIGSTOP)
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
     wait_for(lambda: not runs(run))
-    reach(client, ask(client, seed=10), "ready")  # by the same worker, which went on
+    reach(client, ask(client, **SOON, seed=10), "ready")  # by the same worker, which went on
     assert read(client, policy)["error"] == "cancelled"
 
 
 def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, client):
-    policy = ask(client, options=LONG, seed=2)
+    policy = ask(client, **LATER, seed=2)
     reach(client, policy, "training")
     (run,) = children(learner_of(server))
     os.kill(run, signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed")
     assert "signal 9" in read(client, policy)["error"]
-    assert ask(client, options=LONG, seed=2)["status"] == "queued"
+    assert ask(client, **LATER, seed=2)["status"] == "queued"
     client.delete(f"/v1/policies/{policy['id']}")
 
 
@@ -207,16 +212,16 @@ def test_a_run_that_rq_kills_at_its_limit_says_so_too(tmp_path, status):
 
 
 def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, client):
-    policy = ask(client, options=LONG, seed=3)
+    policy = ask(client, **LATER, seed=3)
     reach(client, policy, "training")
     os.kill(learner_of(server), signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed")
     assert "worker is gone" in read(client, policy)["error"]
-    reach(client, ask(client, seed=4), "ready")
+    reach(client, ask(client, **SOON, seed=4), "ready")
 
 
 def test_a_run_that_gets_no_time_of_the_processor_is_not_taken_for_dead(server, client):
-    policy = ask(client, options=LONG, seed=5)
+    policy = ask(client, **LATER, seed=5)
     reach(client, policy, "training")
     (run,) = children(learner_of(server))
     os.kill(run, signal.SIGSTOP)
@@ -289,7 +294,7 @@ def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(orpha
 
 
 def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):
-    running, waiting = (ask(client, options=LONG, seed=seed) for seed in (7, 8))
+    running, waiting = (ask(client, **LATER, seed=seed) for seed in (7, 8))
     reach(client, running, "training")
     stopped = learner_of(server)
     (run,) = children(stopped)
