@@ -97,13 +97,13 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path, browse):
         draw(page, floor, "Circle", (1.0, 1.0), (1.5, 1.0), "Dock")
         draw(page, floor, "Rectangle", (2.6, 1.4), (3.4, 2.4), "Stairs")
         rule = page.get_by_role("textbox", name="Rule")
-        rule.fill("F[0,60] Dok and G[0,80] not touches(Stairs)")
+        rule.fill("F[0,30] Dok and G[0,40] not touches(Stairs)")
         assert page.locator(".under mark").inner_text() == "Dok"
         page.get_by_text("nothing declares 'Dok'").wait_for()
         look(page, "rule-wrong")
         assert page.get_by_role("button", name="Make it").is_disabled()
-        rule.fill("F[0,60] Dock and G[0,80] not touches(Stairs)")
-        page.get_by_text("steps 0 to 80").first.wait_for()
+        rule.fill("F[0,30] Dock and G[0,40] not touches(Stairs)")
+        page.get_by_text("steps 0 to 40").first.wait_for()
         assert page.locator(".timeline li").count() == 2
         look(page, "rule")
         page.get_by_label("Name", exact=True).fill("dock-first")
@@ -410,8 +410,8 @@ def test_a_real_house(own, browse):
         page.locator(".walls image").wait_for(state="attached")
         draw(page, Floor(page), "Rectangle", (9.9, 7.0), (10.3, 7.5), "Wet")
         rule = page.get_by_role("textbox", name="Rule")
-        rule.fill("F[0,80] LivingRoom and G[0,100] not (Bathroom or touches(Wet))")
-        page.get_by_text("steps 0 to 100").first.wait_for()
+        rule.fill("F[0,50] LivingRoom and G[0,60] not (Bathroom or touches(Wet))")
+        page.get_by_text("steps 0 to 60").first.wait_for()
         page.get_by_label("Name", exact=True).fill("living-room")
         page.get_by_role("button", name="Make it").click()
         page.locator(".badge.ready").wait_for()
@@ -420,7 +420,7 @@ def test_a_real_house(own, browse):
         Floor(page).click(9.75, 7.25)  # in the kitchen, where the house has its agent
         page.get_by_role("heading", name="Step 0").wait_for()
         forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
-        why = "the best way found does not keep 'G[0,100] not (Bathroom or touches(Wet))'"
+        why = "the best way found does not keep 'G[0,60] not (Bathroom or touches(Wet))'"
         assert why in forbidden.inner_text()
         look(page, "real-house-forbidden")
         page.get_by_role("button", name="Push the robot").click()
