@@ -3,8 +3,9 @@
     python -m tests.template     # standard input is a socket from `tests.serving`
 
 A fork takes 10 ms, where a new interpreter needs a second or two of a processor until it serves. What a fork
-runs is the command line, `specshield.cli.main`, with arguments, environment and files of its own. A server's
-process for heavy work is a fork too.
+runs is the command line, `specshield.cli.main`, with arguments, environment, files and a session of its own.
+The server that a command starts is a fork of the command, and a server's process for heavy work one of the
+server.
 """
 
 from __future__ import annotations
@@ -14,17 +15,25 @@ import contextlib
 import gc
 import importlib
 import json
+import math
 import os
 import signal
 import socket
+import subprocess
 import sys
 import tempfile
+import time
+import traceback
+from types import SimpleNamespace
+from typing import Any
 
 from PIL import Image
 
 from specshield import cli
 from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
+from specshield.sim import service
+from tests.serving import READ_AT_IMPORT
 
 SERVER = (
     "anyio._backends._asyncio",
@@ -48,6 +57,7 @@ COMMANDS = (
     "specshield.service.access.commands",
     "specshield.sim.demo",
 )
+BEGUN_WITH = {**os.environ}
 EVALUATION = ("evaluation.plan", "scipy.stats")  # before the first command that needs them: a second
 
 
@@ -90,6 +100,7 @@ def _keep(told: socket.socket) -> None:
     pid = os.fork()
     if pid == 0:
         told.close()
+        os.setsid()
         _run(**command)
         return
     with contextlib.suppress(BrokenPipeError):  # nobody asks any more
@@ -116,7 +127,29 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     if arguments[:1] == ["serve"]:
         prepared = _prepared()
         heavy.Template = lambda: prepared  # type: ignore[assignment,misc]
+    else:
+        service.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": _own_server})  # type: ignore
     cli.main()
+
+
+def _own_server(command: list[str], **options: Any) -> Any:
+    """The server that a command starts, while the command has no threads."""
+    environment = options["env"]
+    if any(environment.get(name) != BEGUN_WITH.get(name) for name in READ_AT_IMPORT):
+        return subprocess.Popen(command, **options)
+    forked = Fork()
+    if forked.pid == 0:
+        try:
+            options["preexec_fn"]()
+            log = f"/proc/self/fd/{options['stdout'].fileno()}"
+            _run(command[3:], environment, log, log, ".")
+            _end(0)
+        except SystemExit as ended:
+            _end(ended.code)
+        except BaseException:
+            traceback.print_exc()
+            _end(1)
+    return forked
 
 
 def _prepared() -> pool.Template:
@@ -133,25 +166,45 @@ def _prepared() -> pool.Template:
     return prepared
 
 
+def _end(code: Any) -> None:
+    """As an interpreter ends, without the command's part of the stack."""
+    if isinstance(code, str):
+        print(code, file=sys.stderr)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(1 if isinstance(code, str) else code or 0)
+
+
 class Fork:
-    """It has of a Popen what the pool uses."""
+    """A child of this process. It has of a Popen what is used."""
 
     def __init__(self) -> None:
         self.pid = os.fork()
-        self._ended = False
+        self._code: int | None = None
 
     def poll(self) -> int | None:
-        self._ended = self._ended or os.waitpid(self.pid, os.WNOHANG)[0] == self.pid
-        return 0 if self._ended else None
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def terminate(self) -> None:
+        self._send(signal.SIGTERM)
 
     def kill(self) -> None:
-        if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+        self._send(signal.SIGKILL)
 
-    def wait(self) -> None:
-        if not self._ended:
-            os.waitpid(self.pid, 0)
-            self._ended = True
+    def _send(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def wait(self, timeout: float = math.inf) -> int:
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("specshield", timeout)
+            time.sleep(0.01)
+        return code
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import pytest
 
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
-from tests.serving import HUNG, children, run_specshield, runs, wait_for
+from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
 
 SPECSHIELD = (sys.executable, "-m", "specshield.cli")
 
@@ -32,23 +32,21 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert "page of both" not in done.stdout  # the service has ended
 
 
-def listens_to_interrupts():
-    """In a child: what a background shell starts ignores SIGINT, and so do its own children."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+def begun(folder, *arguments):
+    """The command, in a session of its own, and the files that it writes to."""
+    out, err = folder / "stdout", folder / "stderr"
+    out.touch()
+    err.touch()
+    return Forked([*arguments], {**os.environ}, stdout=out, stderr=err, cwd=folder), out, err
 
 
 def test_demo_leaves_its_page_up_when_asked(tmp_path):
-    command = [*SPECSHIELD, "demo", "--runs", "1", "--seed", "4", "--open", "--out", str(tmp_path)]
-    running = subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        preexec_fn=listens_to_interrupts,
-    )
+    asked = ("demo", "--runs", "1", "--seed", "4", "--open", "--out", str(tmp_path))
+    running, told, _ = begun(tmp_path, *asked)
     try:
-        page = next(line for line in running.stdout if line.startswith("page of both")).split(": ", 1)[1]
-        url, _, ids = page.strip().partition("/#/floor?sessions=")
+        wait_for(lambda: "Ctrl-C ends both" in told.read_text() or running.poll() is not None)
+        page = next(line for line in told.read_text().splitlines() if line.startswith("page of both"))
+        url, _, ids = page.split(": ", 1)[1].partition("/#/floor?sessions=")
         told = [
             httpx.get(f"{url}/v1/sessions/{id}/trajectory", timeout=None, verify=False).json()["items"]
             for id in ids.split(",")
@@ -71,19 +69,12 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         "demo": ["demo", "--out", str(tmp_path)],
         "evaluate": ["evaluate", "--case", "case1", "--methods", "ours", "--processes", "2"],
     }[command]
-    with open(tmp_path / "told", "w") as told:
-        running = subprocess.Popen(
-            [*SPECSHIELD, *arguments, "--runs", "500"],
-            stdout=subprocess.DEVNULL,
-            stderr=told,
-            start_new_session=True,
-            preexec_fn=listens_to_interrupts,
-        )
+    running, _, told = begun(tmp_path, *arguments, "--runs", "500")
     try:
         if command == "demo":
             wait_for(lambda: len(children(running.pid)) >= 3)  # the server, a robot, and the tracker as below
             started = [each for child in children(running.pid) for each in (child, *children(child))]
-            assert len(started) > 3  # the store's keeper, too
+            assert len(started) > 4  # the store's keeper and a process for heavy work, too
         else:
             wait_for(lambda: len(children(running.pid)) >= 3)  # two workers and what tracks their semaphores
             started = children(running.pid)
@@ -94,7 +85,7 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         assert running.wait(HUNG) != 0
         wait_for(lambda: not any(map(runs, started)))
         # A process that is just starting when its parent is killed cannot but say so.
-        assert how == signal.SIGKILL or "Traceback" not in (tmp_path / "told").read_text()
+        assert how == signal.SIGKILL or "Traceback" not in told.read_text()
     finally:
         running.kill()
 
