@@ -5,8 +5,6 @@ import math
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -29,7 +27,7 @@ from specshield.sim import cases
 from specshield.sim.cases import load_case
 from specshield.world.regions import signed_distance
 from tests.oracles.judge import margin
-from tests.serving import HUNG, children, command_line, wait_for
+from tests.serving import HUNG, Forked, children, command_line, wait_for
 
 EXPERIMENT = Experiment("case1", noise="gaussian", seed=5)
 METHODS = ["unmodified", "ours@0.03/8"]
@@ -215,10 +213,8 @@ def listening(url):
 
 
 def worker(url, folder):
-    return subprocess.Popen(
-        [sys.executable, "-m", "specshield.cli", "worker"],
-        env={**os.environ, "REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder)},
-    )
+    environment = {**os.environ, "REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder)}
+    return Forked(["worker"], environment, stdout=folder / "told", stderr=folder / "told", cwd=folder)
 
 
 def learner(worker):
@@ -251,7 +247,7 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
         os.kill(found[0], signal.SIGKILL)
         assert same(returned(result, process)) == same(serial)
     finally:
-        process.terminate()
+        process.send_signal(signal.SIGTERM)
         process.wait(HUNG)
 
 
@@ -278,7 +274,7 @@ def test_runs_that_the_store_forgets_are_given_out_again_but_not_for_ever(serial
             os.kill(stopped, signal.SIGCONT)
         assert same(returned(result, process)) == same(serial[:2])
     finally:
-        process.terminate()
+        process.send_signal(signal.SIGTERM)
         process.wait(HUNG)
 
 

@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 
 import httpx
 import pytest
@@ -12,8 +10,6 @@ import pytest
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
 from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
-
-SPECSHIELD = (sys.executable, "-m", "specshield.cli")
 
 
 def specshield(*arguments, code=0):
@@ -97,7 +93,7 @@ def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     for option in ("units=8", "evaluate_every=100", "evaluation_starts=50"):
         arguments += ["--option", option]
     arguments += ["--out", str(out)]
-    command = subprocess.Popen([*SPECSHIELD, *arguments], stderr=subprocess.DEVNULL)
+    command, *_ = begun(tmp_path, *arguments)
     wait_for((out / "checkpoint" / "state.safetensors").exists)
     command.kill()
     command.wait()
