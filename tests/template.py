@@ -160,7 +160,8 @@ def _prepared() -> pool.Template:
     if prepared._process.pid == 0:
         prepared._control.close()
         os.setsid()
-        child.template(theirs)  # until the server has ended, if nothing is asked of it
+        if theirs.recv(1, socket.MSG_PEEK):  # it reads its settings when it is wanted, not before
+            child.template(theirs)
         os._exit(0)
     theirs.close()
     return prepared
