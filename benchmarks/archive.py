@@ -140,7 +140,7 @@ async def measure(store: ArchivingStore, archive: Archive, kinds: list[Dump], st
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.archive")
-    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--steps", type=int, default=1_000_000, help=f"at least; {ROOM} sessions at a time")
     parser.add_argument("--episodes", type=int, default=8, help="that are unlike each other")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--place", help="folder or fsspec URL; a temporary folder if left out")

@@ -80,7 +80,8 @@ def turns(grid: OccupancyGrid, random: np.random.Generator) -> Iterator[tuple[bo
             continue
         for motion, (move, angle) in enumerate(STRETCH.motions):
             if move == 0.0 and angle != 0.0:
-                made = step(body, *pose.tolist(), motion)[2] != pose[2]
+                x, y, theta = pose.tolist()
+                made = step(body, x, y, theta, motion)[2] != pose[2]
                 yield made, room_left(squares, pose, angle)
 
 

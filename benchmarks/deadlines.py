@@ -1,6 +1,6 @@
 """`not A U[0,b] B` near its deadline: of the starts that an exact search finds feasible, those accepted.
 
-    python -m benchmarks.deadlines [--n 200] [--seed 0] [--method planner]
+    python -m benchmarks.deadlines [--n 200] [--seed 0] [--episodes 1]
 
 Houses are drawn (evaluation/model/floor_plans.py), a new one for every ten starts. B is a disc or a small one
 somewhere; A is a disc in the free space, most often on the straight line to B. The search (exact.py) shares
@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter, defaultdict
-from importlib import import_module
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +24,7 @@ from evaluation.model.floor_plans import House, random_house
 from evaluation.statistics import clopper_pearson
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
+from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.episode import Shield, decide, make_shield, start
@@ -96,15 +96,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Starts of `until` near their deadline.")
     parser.add_argument("--n", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--method", default="planner", choices=("planner", "reachability"))
     parser.add_argument("--episodes", type=int, default=1, help="0 or 1 for each accepted start")
     asked = parser.parse_args()
-    method = import_module(f"specshield.policy.{asked.method}.policy")
     counts: dict[int, Counter[str]] = defaultdict(Counter)
     took: dict[int, list[float]] = defaultdict(list)
     for n in range(asked.n):
         spare, (task, pose, goal, shut) = n % SPARE, the(n, asked.seed)
-        shield = make_shield([method.synthesise(task)])
+        shield = make_shield([synthesise(task)])
         accepted, began = True, time.perf_counter()
         try:
             start(shield, pose.tolist())

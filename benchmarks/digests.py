@@ -82,10 +82,10 @@ def shield_of(setting: Setting) -> tuple[Case, Shield]:
     if setting.method == "lookahead":
         computed = [shipped(case, "reachability")]
         return case, make_shield(computed, setting.config, prepare(case.task, computed))
-    policy = shipped(case, setting.method.removesuffix("-literal"))
+    learned: Any = shipped(case, setting.method.removesuffix("-literal"))
     if setting.method.endswith("-literal"):
-        policy = replace(policy, literal=True)  # type: ignore[type-var]
-    return case, make_shield([policy], setting.config)
+        learned = replace(learned, literal=True)
+    return case, make_shield([learned], setting.config)
 
 
 def episodes(setting: Setting, seed: int) -> Iterator[list[str]]:

@@ -8,14 +8,16 @@ go; what it does not find may exist all the same.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
-from numba import njit  # not cached: on the disk it would not notice that the package's functions changed
 from numpy.typing import NDArray
 
 from specshield.robot.dynamics import Body, motion_count, step
 
+# Not cached: on the disk it would not notice that the package's functions changed.
+compiled: Any = numba.njit
 Floats = NDArray[np.float64]
 FINE, COARSE = 0.01, 0.1  # [m] what poses are told apart by, near the goal and elsewhere
 ABOUT = 0.6  # [m] how far from the goal is near
@@ -51,14 +53,14 @@ class Goal(NamedTuple):
         return np.asarray(inside)
 
 
-@njit
+@compiled
 def _is_near(goal: Goal, x: float, y: float) -> bool:
     off = math.hypot(x - goal.x, y - goal.y) - goal.radius if goal.radius < math.inf else -math.inf
     off = max(off, goal.xs[0] - x, x - goal.xs[1], goal.ys[0] - y, y - goal.ys[1])
     return -math.inf < off < ABOUT
 
 
-@njit
+@compiled
 def _is_at(goal: Goal, x: float, y: float, theta: float) -> bool:
     if goal.radius < math.inf and not math.hypot(x - goal.x, y - goal.y) < goal.radius:
         return False
@@ -67,7 +69,7 @@ def _is_at(goal: Goal, x: float, y: float, theta: float) -> bool:
     )
 
 
-@njit
+@compiled
 def _is_out(shut: Floats, x: float, y: float) -> bool:
     out = True
     for n in range(shut.shape[0]):
@@ -75,7 +77,7 @@ def _is_out(shut: Floats, x: float, y: float) -> bool:
     return out
 
 
-@njit
+@compiled
 def fewest_steps(
     body: Body, goal: Goal, x: float, y: float, theta: float, steps: int, most: int, shut: Floats
 ) -> int:

@@ -150,7 +150,8 @@ def forbidden(case: Case, seed: int, counts: Counter[str]) -> None:
         counts[f"of these a way is known, {case.uncertainty}"] += KNOWN in (told.detail or "")
     t, action, told = choices[random.integers(len(choices))]
     decision, x_t = decisions[t], poses[t]
-    x_next = np.array(step(case.body, *x_t.tolist(), int(STRETCH.motion_of[action])))
+    x, y, theta = x_t.tolist()
+    x_next = np.array(step(case.body, x, y, theta, int(STRETCH.motion_of[action])))
     history = np.array([*poses[: t + 1], x_next])
     _heading(case, f"forbidden at step {t}")
     print(f"- asked: '{STRETCH.action_names[action]}' at {_shown(x_t)}, which leads to {_shown(x_next)}")

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,8 @@ from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.progress import make_rules, replay
 from specshield.policy.reachability.guide import make_scratch
-from specshield.policy.reachability.policy import ReachabilityPolicy, Settings, synthesise
+from specshield.policy.reachability.method import Settings
+from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.policy.reachability.tables import Guide, slack
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, in_collision, motion_count, simulate, step
@@ -118,12 +120,13 @@ class Slack:
         rules, scratch = self.guide.rules, self.scratch
         progress = replay(rules, rules.margin, history, np.empty((len(history), 0)))
         scratch.status[:], scratch.run[:] = progress
-        return float(slack(self.guide, *history[-1].tolist(), len(history) - 1, scratch))
+        x, y, theta = history[-1].tolist()
+        return float(slack(self.guide, x, y, theta, len(history) - 1, scratch))
 
     def after(self, history: Floats) -> Floats:
         """[M]: after each motion from x_t."""
-        last = history[-1].tolist()
-        after = [step(self.guide.body, *last, m) for m in range(motion_count(self.guide.body))]
+        x, y, theta = history[-1].tolist()
+        after = [step(self.guide.body, x, y, theta, m) for m in range(motion_count(self.guide.body))]
         return np.array([self.here(np.concatenate([history, [pose]])) for pose in after])
 
 
@@ -209,7 +212,7 @@ def _check(out: Outcome, shield: Shield, judge: Judge, past: Floats, decision: D
         out.unsound += len(rows) - int(judge.keeps(trajectories(shield.body, past, rows)).sum())
 
 
-def campaign(case: Case, policies: Sequence[Proposer], tables: ReachabilityPolicy, n: int, seed: int) -> str:
+def campaign(case: Case, policies: Sequence[Any], tables: ReachabilityPolicy, n: int, seed: int) -> str:
     """A row: n episodes from feasible starts, the i-th decided by seed and i alone."""
     shield = make_shield(list(policies), Config(seed=seed))
     judge = Judge(str(case.task.formula), case.spec["regions"])

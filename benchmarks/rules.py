@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.planner.policy import PlannerPolicy, Settings, synthesise
+from specshield.policy.planner.method import Settings
+from specshield.policy.planner.policy import PlannerPolicy, synthesise
 from specshield.robot import STRETCH
 from specshield.shield.episode import Carry, Config, Shield, close, decide, make_shield, start
 from specshield.sim.cases import Case, load_case

@@ -29,7 +29,8 @@ from benchmarks.worlds import KINDS, SHAPES, Kind, World, make_world
 from specshield.client import Session, ShieldClient
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
 from specshield.policy.methods import Run
-from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.method import Settings
+from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import in_collision, make_body, motion_count, successors
 from specshield.sim.service import own_server
 from specshield.task import make_task

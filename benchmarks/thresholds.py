@@ -126,7 +126,8 @@ def kept(world: World, shield: Shield | None, how: How, asked: float, run: int) 
             action, carry = found.action, found.carry
         pose = poses[-1]
         if not random.random() < how.slip:
-            ahead = np.array(step(body, *pose, action))
+            x, y, theta = pose
+            ahead = np.array(step(body, x, y, theta, action))
             moves = not np.array_equal(ahead, pose)
             off = ahead + moves * random.normal(0.0, 1.0, 3) * (how.move, how.move, how.turn)
             pose = pose if in_collision(body, *off) else off

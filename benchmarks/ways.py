@@ -12,12 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
-from numba import njit  # not cached: on the disk it would not notice that the package's functions changed
 from numpy.typing import NDArray
 
 from specshield.robot.dynamics import Body, step
 
+# Not cached: on the disk it would not notice that the package's functions changed.
+compiled: Any = numba.njit
 Floats = NDArray[np.float64]
 Disc = tuple[float, float, float]  # x, y, radius [m]
 CELL, HEADINGS = 0.1, 60  # [m] and per turn: what counts as one place
@@ -101,12 +103,12 @@ def earliest(
     return int(_search(body, wait, history[-1], now, met, begun, rows, guards, until, seen, cell))
 
 
-@njit
+@compiled
 def _inside(x: float, y: float, row: Floats) -> bool:
     return math.hypot(x - row[0], y - row[1]) < row[2]
 
 
-@njit
+@compiled
 def _allowed(x: float, y: float, t: int, met: int, guards: Floats) -> bool:
     for g in range(guards.shape[0]):
         row = guards[g]
@@ -118,7 +120,7 @@ def _allowed(x: float, y: float, t: int, met: int, guards: Floats) -> bool:
     return True
 
 
-@njit
+@compiled
 def _stands(x: float, y: float, first: int, last: int, met: int, guards: Floats) -> bool:
     stands = True
     for s in range(first, last + 1):
@@ -126,7 +128,7 @@ def _stands(x: float, y: float, first: int, last: int, met: int, guards: Floats)
     return stands
 
 
-@njit
+@compiled
 def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen, cell):  # type: ignore[no-untyped-def]
     """A state that was reached may wait where it is; it is gone on from once, and again when a guard ends."""
     every, motions, last = seen.shape[0] - 1, body.translate.shape[0], now
@@ -189,7 +191,7 @@ def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen, cell)
     return -1
 
 
-@njit
+@compiled
 def _place(body, x, y, h, cell):  # type: ignore[no-untyped-def]
     j, k = int((y - body.origin_y) / cell), int((x - body.origin_x) / cell)
     return j, k, round(h * HEADINGS / (2 * math.pi)) % HEADINGS

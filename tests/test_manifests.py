@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,10 @@ import kubernetes_validate
 import pytest
 import yaml
 
+from specshield.cli import serve
 from specshield.service.leaving import GRACE
 from specshield.service.settings import Settings
+from tests.test_documented import commands, options
 
 DOCKER = Path(__file__).parent.parent / "docker"
 FILES = sorted((DOCKER / "kubernetes").glob("*.yaml"))
@@ -54,6 +58,27 @@ def test_what_the_manifests_name_is_there():
     target = named["HorizontalPodAutoscaler", "specshield"]["spec"]["scaleTargetRef"]
     assert (target["kind"], target["name"]) in named
     assert "replicas" not in named["Deployment", "specshield"]["spec"]  # the autoscaler's to say
+
+
+def test_what_containers_run_and_probe_is_there():
+    """Commands with their options, the port that the server listens on, and the addresses of probes."""
+    dockerfile = (DOCKER / "Dockerfile").read_text()
+    ran = [json.loads(found) for found in re.findall(r"^CMD (\[.*\])$", dockerfile, re.MULTILINE)]
+    port = inspect.signature(serve).parameters["port"].default
+    assert f"EXPOSE {port}\n" in dockerfile
+    asked = re.findall(rf"http://127.0.0.1:{port}(/\w+)", dockerfile)
+    for (kind, name), document in everything().items():
+        if kind == "Deployment":
+            (container,) = document["spec"]["template"]["spec"]["containers"]
+            ran.append(container["args"])
+            assert [each["containerPort"] for each in container.get("ports", [])] in ([], [port]), name
+            asked += [of["httpGet"]["path"] for each, of in container.items() if each.endswith("Probe")]
+    assert len(ran) == 4
+    for program, name, *words in ran:
+        assert program == "specshield"
+        assert {word for word in words if word.startswith("-")} <= options(commands()[name])
+    assert len(asked) == 3
+    assert set(asked) <= json.loads((DOCKER.parent / "openapi.json").read_text())["paths"].keys()
 
 
 def labels(pod: dict[str, Any]) -> dict[str, str]:

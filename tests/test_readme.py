@@ -83,17 +83,3 @@ def test_links_lead_somewhere(page):
         headings = re.findall(r"^#+ (.+)$", target.read_text(), re.MULTILINE) if heading else []
         anchors = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in headings}
         assert not heading or heading in anchors, f"{page.name}: {link}"
-
-
-def test_commands_that_pages_name_are_there():
-    """`python -m benchmarks.x`, `make x`, `examples/x.py` and `tests/x.py` in the pages."""
-    make = (ROOT / "Makefile").read_text()
-    for page in LINKED:
-        text = page.read_text()
-        for module in re.findall(r"-m ((?:benchmarks|evaluation)[\w.]*)", text):
-            path = ROOT.joinpath(*module.split("."))
-            assert path.with_suffix(".py").exists() or path.is_dir(), f"{page.name}: {module}"
-        for target in re.findall(r"`make ([\w-]+)", text):
-            assert re.search(rf"^{target}:", make, re.MULTILINE), f"{page.name}: make {target}"
-        for file in re.findall(r"`((?:examples|tests|evaluation|benchmarks|app|docs)/[\w/.-]+)`", text):
-            assert (ROOT / file).exists() or (page.parent / file).exists(), f"{page.name}: {file}"
