@@ -693,7 +693,8 @@ def test_no_action_is_said_to_keep_a_broken_rule_nor_signals_to_be_metres(server
 
 
 def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path, browse):
-    with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browse() as (page, _):
+    """Any key that a server may have, also one with a space. What no header can carry is not sent."""
+    with serving(tmp_path, SPECSHIELD_API_KEY="a secret~key!") as running, browse() as (page, _):
         page.goto(running.url)
         field = page.get_by_label("API key")
         field.wait_for()
@@ -702,7 +703,9 @@ def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path, browse):
         field.fill("wrong")
         field.press("Enter")
         page.get_by_text("does not know this key").wait_for()
-        field.fill("a-secret-key")
+        for typed in ("cl\u00e9", "a\u200bkey", "  ", " a secret~key! "):
+            field.fill(typed)
+            assert field.evaluate("field => field.checkValidity()") == ("secret" in typed), typed
         field.press("Enter")
         page.get_by_text("No robot is here yet").wait_for()
         page.get_by_role("link", name="Policies", exact=True).click()
