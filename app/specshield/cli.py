@@ -271,9 +271,8 @@ def _check_exposure(host: str, settings: Settings) -> None:
     from specshield.service.access.commands import on_keys
     from specshield.service.access.site import is_loopback
 
-    if is_loopback(host) or settings.api_key is not None:
-        return
-    if not on_keys(lambda keys: keys.listed(), settings):
+    exposed = not is_loopback(host) and settings.api_key is None
+    if exposed and not on_keys(lambda keys: keys.listed(), settings):
         raise InputError(
             f"whoever reaches {host} could use this server, since it asks for no key",
             path="--host",

@@ -7,9 +7,11 @@ import os
 import re
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
+import psutil
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -87,12 +89,19 @@ def test_what_several_processes_count_is_true_and_outlives_each_of_them(tmp_path
 
         steps(6)
         counted(6)
-        os.kill(workers(server)[0], signal.SIGKILL)
-        ready(server, 3)
+        with ExitStack() as watched:
+            url = f"{server.url}/v1/sessions/{begin(server)}/events"
+            for _ in range(3):
+                watched.enter_context(httpx.stream("GET", url, timeout=None, verify=False))
+            assert samples(server)["specshield_watchers",] == 3
+            busier = max(workers(server), key=lambda pid: len(psutil.Process(pid).net_connections()))
+            os.kill(busier, signal.SIGKILL)
+            ready(server, 3)
+            assert samples(server)["specshield_watchers",] <= 1  # its streams are closed
         counted(6)
         steps(6)
         counted(12)
-        wait_for(lambda: samples(server)["specshield_sessions",] == 12)
+        wait_for(lambda: samples(server)["specshield_sessions",] == 13)
 
 
 def test_a_line_tells_who_asked_and_never_what_must_not_be_told(tmp_path):

@@ -13,8 +13,11 @@ from specshield.service.leaving import notice_killed
 from tests.serving import HUNG
 
 
-def test_a_worker_that_is_killed_while_it_is_asked_is_noticed_at_once(monkeypatch):
+def test_a_worker_that_is_killed_while_it_is_asked_is_noticed_at_once(monkeypatch, tmp_path):
+    """And what it had open is forgotten, of it alone."""
     monkeypatch.setattr(Process, "start", Process.start)  # so that what follows is undone
+    monkeypatch.setattr(Process, "join", Process.join)
+    monkeypatch.setenv("PROMETHEUS_MULTIPROC_DIR", str(tmp_path))
     notice_killed()
     worker = Process(Config("none:app"), [])
     hung = ([], [], [worker.child_conn])  # waits for ever, and holds the pipe as a worker does
@@ -24,4 +27,8 @@ def test_a_worker_that_is_killed_while_it_is_asked_is_noticed_at_once(monkeypatc
         asked = supervisor.submit(worker.is_ready, 10 * HUNG)
         worker.process.kill()
         assert asked.result(HUNG) is False
+    kept, forgotten = ("counter_{}.db", "gauge_livesum_1{}.db"), "gauge_livesum_{}.db"
+    for name in (*kept, forgotten):
+        (tmp_path / name.format(worker.pid)).touch()
     worker.join()
+    assert {path.name for path in tmp_path.iterdir()} == {name.format(worker.pid) for name in kept}

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from prometheus_client.multiprocess import mark_process_dead
 from uvicorn.supervisors.multiprocess import Process
 
 if TYPE_CHECKING:  # the parent of several servers decides nothing
@@ -59,18 +60,24 @@ def drain_at_sigterm(startup: Startup, seconds: float) -> None:
 
 
 def notice_killed() -> None:
-    """From now on the supervisor closes its own copy of a worker's end of the pipe between them.
+    """From now on the supervisor closes its own copy of a worker's end of the pipe between them, and the
+    metrics forget the streams of a worker that has ended.
 
     It asks each worker for a sign of life through that pipe. With the copy open, it does not see the end of
     one that is killed while it is asked, and waits as long as a worker may take to start.
     """
-    start = Process.start
+    start, join = Process.start, Process.join
 
     def start_and_close(worker: Process) -> None:
         start(worker)
         worker.child_conn.close()
 
+    def join_and_forget(worker: Process) -> None:
+        join(worker)
+        mark_process_dead(worker.pid)  # type: ignore[no-untyped-call]
+
     Process.start = start_and_close  # type: ignore[assignment, method-assign]
+    Process.join = join_and_forget  # type: ignore[assignment, method-assign]
 
 
 def _tell(told: Callable[[Callable[[], object]], None], *numbers: signal.Signals) -> None:

@@ -40,9 +40,7 @@ request_seconds = Histogram(
     "specshield_request_seconds", "Time to answer.", ["method", "route"], buckets=SECONDS, registry=registry
 )
 refusals = Counter("specshield_refusals", "Problem documents sent.", ["type"], registry=registry)
-watchers = Gauge(
-    "specshield_watchers", "Streams of events that are open.", registry=registry, multiprocess_mode="livesum"
-)
+watchers = Gauge("specshield_watchers", "Open event streams.", registry=registry, multiprocess_mode="livesum")
 build = Gauge(
     "specshield_build_info", "1, with the version.", ["version"], registry=registry, multiprocess_mode="max"
 )
@@ -129,9 +127,7 @@ def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) ->
 
 def exposition(gauges: Iterable[Metric] = ()) -> bytes:
     """Prometheus text format: what all processes counted, and `gauges`."""
-    every = registry
-    if "PROMETHEUS_MULTIPROC_DIR" in os.environ:
-        every = CollectorRegistry()
-        multiprocess.MultiProcessCollector(every)  # type: ignore[no-untyped-call]
-    own: Any = SimpleNamespace(collect=lambda: [*cells.collect(), *gauges])  # all that is asked of a registry
-    return prometheus.generate_latest(every) + prometheus.generate_latest(own)
+    several = "PROMETHEUS_MULTIPROC_DIR" in os.environ
+    counted: Any = multiprocess.MultiProcessCollector(None) if several else registry  # type: ignore[no-untyped-call]
+    every: Any = SimpleNamespace(collect=lambda: [*counted.collect(), *cells.collect(), *gauges])
+    return prometheus.generate_latest(every)

@@ -74,9 +74,8 @@ def _environment(data: Path, worker: bool, key: str | None, complete: bool) -> d
         for name, value in os.environ.items()
         if name in shipped or (not name.startswith("SPECSHIELD_") and name != "REDIS_URL")
     }
-    given = {"API_KEY": key} if key is not None else {}
-    own = {"DATA_DIR": data, "WORKER": worker, "COMPLETE": complete, **given}
-    return kept | {f"SPECSHIELD_{name}": str(value) for name, value in own.items()}
+    own = {"DATA_DIR": data, "WORKER": worker, "COMPLETE": complete, "API_KEY": key}
+    return kept | {f"SPECSHIELD_{name}": str(value) for name, value in own.items() if value is not None}
 
 
 def _wait_until_ready(
@@ -90,8 +89,7 @@ def _wait_until_ready(
         except httpx.TransportError:
             time.sleep(0.05)
             continue
-        status = answer.status_code
-        if status == 200:
+        if (status := answer.status_code) == 200:
             return
         say(answer.json()["detail"])
         time.sleep(0.1)
