@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -49,6 +51,9 @@ def evaluate(
     json: Annotated[bool, typer.Option("--json", help="Print figures and records as JSON.")] = False,
 ) -> None:
     """Compare methods on one case, over any number of runs."""
+    if redis is not None:
+        os.environ["REDIS_URL"] = redis
+        import_module("specshield.service.training")  # before rq: in a cluster its keys have other names
     from evaluation import campaigns
     from evaluation.experiment import available, experiments
     from evaluation.houses import located

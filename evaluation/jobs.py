@@ -9,13 +9,13 @@ from datetime import datetime, timedelta, timezone
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
-import redis
 from rq import Queue, Worker
 from rq.exceptions import NoSuchJobError
 from rq.job import Job, JobStatus
 from rq.serializers import JSONSerializer
 
-from specshield.errors import SpecshieldError, StoreError
+from specshield.errors import InputError, SpecshieldError, StoreError
+from specshield.service.storage.connect import FORMS, connect_to_jobs, reaching
 from specshield.service.storage.keeper import follow_parent
 
 if TYPE_CHECKING:  # while a worker waits for jobs it loads none of the core
@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # while a worker waits for jobs it loads none of the core
 QUEUE = "specshield-runs"
 CHUNK = 4  # runs a job
 POLL = 0.2  # [s]
+CONNECT = 5.0  # [s] for a connection to the store
 TIMEOUT = 3600  # [s] for a job
 ATTEMPTS = 3
 SILENT = timedelta(seconds=120)  # a worker that gives no sign of life for so long is taken for dead
@@ -37,13 +38,20 @@ def over_workers(
 ) -> Iterator[list[Record]]:
     """The records of each run, as the workers finish them. Runs that were lost are given out again.
 
-    missing: {run: methods}. Raises StoreError where the store cannot be reached or no worker listens, and
-    SpecshieldError with a failed job's last line, or where runs are lost ATTEMPTS times.
+    missing: {run: methods}. url: of the store, as a server takes it. Raises InputError for one that is none,
+    StoreError where the store cannot be reached or no worker listens, and SpecshieldError with a failed job's
+    last line, or where runs are lost ATTEMPTS times.
     """
     try:
-        yield from _over_workers(redis.Redis.from_url(url), experiment, missing)
-    except (redis.RedisError, OSError) as error:
-        raise StoreError(f"the store cannot be reached: {type(error).__name__}", path="redis") from error
+        with reaching():
+            try:
+                connection = connect_to_jobs(url, socket_connect_timeout=CONNECT)
+            except ValueError:
+                raise InputError("this is not the URL of a store", expected=f"one as {FORMS}") from None
+            yield from _over_workers(connection, experiment, missing)
+    except (InputError, StoreError) as error:
+        error.at("redis")
+        raise
 
 
 def _over_workers(
@@ -54,10 +62,7 @@ def _over_workers(
     queue = Queue(QUEUE, connection=connection, serializer=JSONSerializer)
     if not Worker.all(queue=queue):
         raise StoreError(
-            "no worker listens for runs",
-            path="redis",
-            got=0,
-            expected="`specshield worker` with this REDIS_URL",
+            "no worker listens for runs", got=0, expected="`specshield worker` with this REDIS_URL"
         )
     waiting: dict[str, tuple[Chunk, int]] = {}
 

@@ -28,6 +28,7 @@ from specshield.sim.cases import load_case
 from specshield.world.regions import signed_distance
 from tests.oracles.judge import margin
 from tests.serving import HUNG, Forked, children, command_line, wait_for
+from tests.stores import cluster
 
 EXPERIMENT = Experiment("case1", noise="gaussian", seed=5)
 METHODS = ["unmodified", "ours@0.03/8"]
@@ -249,6 +250,44 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(HUNG)
+
+
+@pytest.mark.skipif(shutil.which("redis-server") is None, reason="redis-server is not installed")
+def test_workers_on_a_cluster_take_runs_too(serial, tmp_path):
+    asked = [
+        "--case",
+        "1",
+        "--runs",
+        "1",
+        "--noise",
+        "gaussian",
+        "--seed",
+        "5",
+        "--methods",
+        ",".join(METHODS),
+    ]
+    with cluster(tmp_path / "nodes") as store:
+        process = worker(store.url, tmp_path / "data")
+        try:
+            names = f"*workers:{QUEUE}"
+            wait_for(lambda: any([*node.scan_iter(names)] for node in store.nodes))
+            asked += ["--methods", ",".join(METHODS), "--redis", store.url, "--out", str(tmp_path / "out")]
+            done = subprocess.run([sys.executable, "-m", "evaluation", "evaluate", *asked], timeout=HUNG)
+            assert done.returncode == 0
+            assert same(read(tmp_path / "out" / "case1" / "gaussian")) == same(serial[:2])
+        finally:
+            process.terminate()
+            process.wait(HUNG)
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [("sentinel://h", "not the URL of a store"), ("redis+sentinel://127.0.0.1:1/s", "cannot be reached")],
+)
+def test_a_store_that_is_none_or_away_is_told_in_words(url, said):
+    with pytest.raises((InputError, StoreError), match=said) as caught:
+        evaluate(EXPERIMENT, 1, METHODS, redis_url=url)
+    assert caught.value.path == "redis"
 
 
 def test_runs_that_the_store_forgets_are_given_out_again_but_not_for_ever(serial, redis, threads, tmp_path):
