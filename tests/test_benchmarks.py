@@ -113,11 +113,12 @@ def test_what_metrics_and_log_cost_a_step_is_measured_on_a_decision():
 def test_what_there_is_not_to_measure_is_told_in_a_line(tmp_path):
     """Decisions that were never made passed for the same; and houses that are not there were a traceback."""
     for module, asked, said in (
-        ("digests", "--only=planer", "no setting has 'planer' in its name"),
-        ("houses", str(tmp_path), "evaluation/houses.py says how to get ProcTHOR houses"),
+        ("digests", ["--only=planer"], "no setting has 'planer' in its name"),
+        ("reliability", ["faults", "--rows=keepr"], "there is no 'keepr'; there are server_embedded, "),
+        ("houses", [str(tmp_path)], "evaluation/houses.py says how to get ProcTHOR houses"),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", f"benchmarks.{module}", asked], capture_output=True, text=True
+            [sys.executable, "-m", f"benchmarks.{module}", *asked], capture_output=True, text=True
         )
         assert done.returncode != 0
         assert said in done.stderr.splitlines()[-1]

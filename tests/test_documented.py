@@ -18,6 +18,7 @@ import typer
 
 import benchmarks
 import evaluation
+from benchmarks.reliability.faults.rows import ROWS
 from specshield import cli
 from specshield.service.settings import Settings
 
@@ -102,6 +103,12 @@ def test_a_program_takes_what_it_is_shown_with(given, monkeypatch, capsys):
     with pytest.raises((Taken, SystemExit)) as ended:
         program.main()
     assert ended.type is Taken or not ended.value.code, f"{SHOWN[given]}: {capsys.readouterr().err}"
+
+
+def test_the_faults_that_a_page_names_are_there():
+    for given, where in SHOWN.items():
+        if "--rows" in given:
+            assert set(given[given.index("--rows") + 1].split(",")) <= ROWS.keys(), where
 
 
 @cache

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.reliability.figures import OUT
@@ -51,21 +52,21 @@ def main() -> int:
     if args.part == "faults":
         from benchmarks.reliability.faults import rows
 
-        names = args.rows.split(",") if args.rows else list(rows.ROWS)
-        return rows.run(args.out, args.kills, names, args.resume, command)
+        return rows.run(args.out, args.kills, some(args.rows, rows.ROWS), args.resume, command)
     if args.part == "fuzz":
         from benchmarks.reliability.fuzz import shards
 
-        names = args.only.split(",") if args.only else list(shards.TARGETS)
+        names = some(args.only, shards.TARGETS)
         return min(1, shards.run(args.out, args.inputs, args.seed, args.workers, names, command))
     if args.part == "load":
         from benchmarks.reliability import load
 
         return load.run(args.out, args.robots, args.seconds, args.rate, args.set, command)
     if args.part == "isolation":
+        from benchmarks import attacks
         from benchmarks.reliability import isolation
 
-        names = args.only.split(",") if args.only else []
+        names = some(args.only, attacks.ATTACKS)
         return min(1, isolation.run(args.out, names, args.resume, command))
     if args.part == "contract":
         from benchmarks.reliability.contract import run
@@ -74,11 +75,21 @@ def main() -> int:
     if args.part == "elsewhere":
         from benchmarks.reliability import elsewhere
 
-        names = args.only.split(",") if args.only else list(elsewhere.MODULES)
-        return min(1, elsewhere.run(args.out, names, args.resume))
+        return min(1, elsewhere.run(args.out, some(args.only, elsewhere.MODULES), args.resume))
     from benchmarks.reliability import report
 
     return report.run(args.out, args.page or report.PAGE)
+
+
+def some(asked: str, known: Collection[str]) -> list[str]:
+    """What is asked for, separated by commas; all that is known where nothing is. Ends the program where
+    something is asked for that is not known.
+    """
+    names = asked.split(",") if asked else list(known)
+    for name in names:
+        if name not in known:
+            sys.exit(f"there is no {name!r}; there are {', '.join(known)}")
+    return names
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ def run(out: Path, names: Sequence[str], resume: bool, command: str) -> int:
     """How many attacks were felt by more than was asked for."""
     kept = (read(out, "isolation") or {}) if resume else {}
     rows: dict[str, Any] = {row["attack"]: row for row in kept.get("rows", [])}
-    for name in names or list(attacks.ATTACKS):
+    for name in names:
         if name in rows:
             continue
         scratch = Path(tempfile.mkdtemp(prefix="rel-"))
