@@ -5,6 +5,8 @@ import math
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -254,25 +256,14 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
 
 @pytest.mark.skipif(shutil.which("redis-server") is None, reason="redis-server is not installed")
 def test_workers_on_a_cluster_take_runs_too(serial, tmp_path):
-    asked = [
-        "--case",
-        "1",
-        "--runs",
-        "1",
-        "--noise",
-        "gaussian",
-        "--seed",
-        "5",
-        "--methods",
-        ",".join(METHODS),
-    ]
+    asked = ["evaluate", "--case", "1", "--runs", "1", "--noise", "gaussian", "--seed", "5"]
     with cluster(tmp_path / "nodes") as store:
         process = worker(store.url, tmp_path / "data")
         try:
             names = f"*workers:{QUEUE}"
             wait_for(lambda: any([*node.scan_iter(names)] for node in store.nodes))
             asked += ["--methods", ",".join(METHODS), "--redis", store.url, "--out", str(tmp_path / "out")]
-            done = subprocess.run([sys.executable, "-m", "evaluation", "evaluate", *asked], timeout=HUNG)
+            done = subprocess.run([sys.executable, "-m", "evaluation", *asked], timeout=HUNG)
             assert done.returncode == 0
             assert same(read(tmp_path / "out" / "case1" / "gaussian")) == same(serial[:2])
         finally:
