@@ -1,4 +1,4 @@
-"""What every route of one server process shares."""
+"""The state that all routes of one server process share, and what their descriptions have in common."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
-PICTURES = 32  # kept in memory, of 5 to 500 kB each
-TOO_MUCH = {"_503": "`busy`: too much is asked of the server just now; ask again after `Retry-After`."}
+PICTURES = 32  # kept in memory; each has 5 to 500 kB
+TOO_MUCH = {"_503": "`busy`: the server has too many requests now; ask again after `Retry-After`."}
+FULL = {"_507": "`insufficient-storage`: the disk is full, or the space that you may use."}
 RETRY_AFTER = {
     "description": "Seconds after which to ask again: with every 503, and with `rate-limited`.",
     "schema": {"type": "integer", "minimum": 1},
@@ -33,7 +34,7 @@ RETRY = {"headers": {"Retry-After": RETRY_AFTER}}
 
 @dataclass
 class Server:
-    """startup: how far this server has come. worker: this server's own, if it has one."""
+    """startup: the progress of this server's start. worker: the training worker that it runs, if any."""
 
     settings: Settings
     store: Store
@@ -61,22 +62,22 @@ Cursor = Annotated[
     str | None,
     Query(max_length=64, description="`next` of the page before; leave it out for the first page."),
 ]
-Limit = Annotated[int, Query(ge=1, le=1000, description="Items a page.")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="The most items that the page may have.")]
 
 
-def json_content(model: str, example: Any) -> dict[str, Any]:
-    """A body in JSON that a route reads by itself."""
+def json_body(model: str, example: Any) -> dict[str, Any]:
+    """OpenAPI's `content` for a JSON body that the route itself reads and checks."""
     schema = {"$ref": f"#/components/schemas/{model}"}
     return {"application/json": {"schema": schema, "example": example}}
 
 
 def problems(**said: str) -> dict[int | str, dict[str, Any]]:
-    """The problem documents a route may answer: problems(_409="history-gap, ...")."""
+    """The problem documents that a route may answer, by status: problems(_409="history-gap, ...")."""
     return problem_documents(_422="Bad input: the field, what it held, what is valid.", **said)
 
 
 def problem_documents(**said: str) -> dict[int | str, dict[str, Any]]:
-    """The problem documents of the statuses that are named, with what is said of each."""
+    """OpenAPI's `responses` for these statuses. said: the description of each, as `_409="..."`."""
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     found = {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}
     return {status: told | RETRY if status in (429, 503) else told for status, told in found.items()}

@@ -1,5 +1,5 @@
-"""What is shown of a session to others: `/v1/sessions/{id}/events`, each decision as it is made, as
-server-sent events; and `/v1/sessions/{id}/record`, all of it, to be verified.
+"""Routes for those who watch or check a session that somebody else steps: `/v1/sessions/{id}/events` and
+`/v1/events` stream decisions as they are made, `/v1/sessions/{id}/record` is the file that can be verified.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/v1", tags=["sessions"])
 
 
 class EventStream(Response):
-    """Sends what the stream gives until it ends, its key is refused, the store is away or the reader gone."""
+    """Sends the stream until it ends, the caller's key is refused, the store is away or the caller leaves."""
 
     media_type = EVENTS
 
@@ -54,7 +54,7 @@ class EventStream(Response):
         await self._stream.aclose()  # type: ignore[attr-defined]
 
 
-EVENT = {  # of each in the stream
+EVENT = {  # the schema of one event
     "type": "object",
     "required": ["data"],
     "properties": {"id": {"type": "string"}, "event": {"type": "string"}, "data": {"type": "string"}},
@@ -68,10 +68,10 @@ EVENT = {  # of each in the stream
     responses={
         200: {
             "content": {EVENTS: {"schema": EVENT}},
-            "description": "Server-sent events: `id` is t, `data` the answer to that step, as JSON. The last "
-            "one is `event: end`. Comments keep the connection alive.",
+            "description": "Server-sent events: `id` is t, `data` the answer to that step as JSON. The last "
+            "event is `event: end`. Comments keep the connection alive.",
         },
-        204: {"description": "The session is over, and nothing follows: do not ask again."},
+        204: {"description": "The session is over and has no further event: do not ask again."},
         **problems(**GONE, _429="The server has no room for more streams."),
     },
 )
@@ -79,18 +79,18 @@ async def events(
     key: SessionKey,
     server: ServerState,
     last_event_id: Annotated[
-        int | None, Header(ge=-1, le=1_000_000, description="As `after`; a browser sends it by itself.")
+        int | None, Header(ge=-1, le=1_000_000, description="The same as `after`; browsers send it.")
     ] = None,
     after: Annotated[
-        int | None, Query(ge=-1, le=1_000_000, description="Begin after this step; -1: with the first.")
+        int | None, Query(ge=-1, le=1_000_000, description="Begin after this step; -1: at the first step.")
     ] = None,
 ) -> Response:
-    """Each decision as it is made, whichever server makes it, about a tenth of a second later.
+    """Each decision, about a tenth of a second after it was made, whichever server made it.
 
-    Without `after` or `Last-Event-ID` it begins with the next decision; with one of them it resumes where the
-    reader was, without a gap and without doubles. Steps that were passed over have no event. The stream ends
-    when the session is finished, when its key is revoked, and when this server stops: then ask again. A
-    reader who is too slow is cut off.
+    Without `after` and `Last-Event-ID` the stream begins with the next decision. With one of them it begins
+    after that step, with no decision left out and none sent twice. Steps without a decision have no event.
+    The stream ends when the session is finished, when the caller's key is revoked, and when this server
+    stops: then ask again. A caller who reads too slowly is cut off.
     """
     stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)
@@ -109,9 +109,10 @@ async def events(
     },
 )
 async def read_record(key: SessionKey, session_id: PathId, server: ServerState) -> Response:
-    """The session's config, poses, signals, what was asked and answered at each step: a chain of hashes.
+    """The session's settings, poses and signals, and the request and the answer of each step, in a chain of
+    hashes.
 
-    `specshield verify` checks the chain, and decides every step again, to the same bytes.
+    `specshield verify` checks the chain and makes every decision again, to the same bytes.
     """
     content, seal = await server.sessions.record(key)
     name = f'attachment; filename="{session_id}.record"'
@@ -119,7 +120,7 @@ async def read_record(key: SessionKey, session_id: PathId, server: ServerState) 
     return Response(content, media_type=chain.MEDIA_TYPE, headers=headers)
 
 
-MOST_SESSIONS = 64  # of one stream; chosen by hand: a page of more is not read
+MOST_SESSIONS = 64  # in one stream; chosen by hand: nobody can follow more on one page
 PLACE = rf"^{ID}(:(-1|[0-9]{{1,7}}))?$"
 Places = Annotated[
     list[Annotated[str, Field(pattern=PLACE)]],
@@ -127,7 +128,8 @@ Places = Annotated[
         min_length=1,
         max_length=MOST_SESSIONS,
         openapi_examples={"example": {"value": [f"{examples.SESSION['id']}:-1"]}},
-        description="Ids of sessions; `id:41` begins after step 41, `id:-1` with the first, `id` now.",
+        description="Ids of sessions; `id:41` begins after step 41, `id:-1` at the first step, `id` with the "
+        "next decision.",
     ),
 ]
 
@@ -139,16 +141,16 @@ Places = Annotated[
     responses={
         200: {
             "content": {EVENTS: {"schema": EVENT}},
-            "description": "Server-sent events: `data` is `session`, `t`, `pose`, `logits`, `decision`, as "
-            "in a trajectory; the last one of a session is `session`, `finished` and `spec_status`.",
+            "description": "Server-sent events: `data` has `session`, `t`, `pose`, `logits`, `decision`, as "
+            "in a trajectory; in the last event of a session, `session`, `finished` and `spec_status`.",
         },
         **problems(_429="The server has no room for more streams."),
     },
 )
 async def several(server: ServerState, owner: Owner, session: Places) -> Response:
-    """What several robots do, in one stream: what a page needs to show them on one floor.
+    """The decisions of several sessions in one stream, as a page needs them to show robots on one floor.
 
-    Sessions that are not there are left out. The stream ends when all of them are over.
+    Sessions that do not exist are left out. The stream ends when all of them are over.
     """
     asked = (place.partition(":") for place in session)
     after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}

@@ -12,18 +12,17 @@ from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import FILES
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.specs import MapList, MapResponse
-from specshield.service.state import TOO_MUCH, Cursor, Limit, ServerState, problems
+from specshield.service.state import FULL, TOO_MUCH, Cursor, Limit, ServerState, problems
 from specshield.world.formats import FORMATS
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
-FULL = "`insufficient-storage`: the disk is full, or what you may keep there."
 MapId = Annotated[
     Id, Path(description="Id or name of a map.", openapi_examples={"case1": {"value": "case1"}})
 ]
 
 
 def _described() -> dict[str, Any]:
-    """The body of `create` in OpenAPI: one schema for each format that is installed."""
+    """The request body of `create` for OpenAPI: one schema for each format that is installed."""
     schemas: dict[bool, list[dict[str, Any]]] = {True: [], False: []}
     examples: dict[str, Any] = {}
     for name, format in FORMATS.usable():
@@ -44,7 +43,7 @@ def _described() -> dict[str, Any]:
         "application/json": {"schema": {"oneOf": schemas[False]}, "examples": examples},
         "multipart/form-data": {"schema": {"oneOf": schemas[True]}},
     }
-    said = "A map in one of these formats: as JSON, where `format` says which it is, or as files."
+    said = "A map in one of these formats: as JSON, in which `format` names the format, or as files."
     return {"requestBody": {"required": True, "description": said, "content": content}}
 
 
@@ -56,16 +55,16 @@ def _described() -> dict[str, Any]:
     responses=problems(
         _409="`name-taken`: something else of yours has the name.",
         _429="The server keeps no more maps.",
-        _507=FULL,
+        **FULL,
         **TOO_MUCH,
     ),
     openapi_extra=_described(),
 )
 async def create(request: Request, server: ServerState, caller: Caller) -> Any:
-    """Maps are immutable and known by the hash of their content: the same map again is the one there is.
-    It is there for the key that sent it.
+    """Maps are immutable, and their id is the hash of their content: the same map sent again has the same id.
+    Only the key that sent a map can use it.
 
-    Outside the map everything is occupied, and so is what is unknown. Rooms become names for formulas.
+    Unknown cells count as occupied, and so does everything outside the map. Formulas can name the rooms.
     """
     body = received(request)
     return await server.heavy.run(request, "add_map", body.content_type, body.content, caller)
@@ -73,8 +72,8 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
 async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """Those that came with the server and your own, in order of name and id. A page may be shorter than
-    `limit`."""
+    """The maps that came with the server and your own, in order of name and id. A page may have fewer items
+    than `limit`."""
     found, following = await asyncio.to_thread(server.maps.page, owner, cursor, limit)
     return {"items": found, "next": following}
 
@@ -83,7 +82,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
     "/{map_id}", response_model=MapResponse, summary="Read a map", responses=problems(_404="No such map.")
 )
 async def read(map_id: MapId, server: ServerState, owner: Owner) -> Any:
-    """Its size, place and named areas."""
+    """The map's size, its place in the map frame, and its named areas."""
     return await asyncio.to_thread(server.maps.show, map_id, owner)
 
 
@@ -97,7 +96,7 @@ async def read(map_id: MapId, server: ServerState, owner: Owner) -> Any:
     },
 )
 async def image(map_id: MapId, request: Request, server: ServerState, owner: Owner) -> Response:
-    """White is free, black occupied; up is the grid's second axis: the map's y if its origin has no turn."""
+    """White cells are free, black ones occupied. The grid's rows are the image's, the last row at the top."""
     return Response(await server.heavy.run(request, "draw_map", map_id, owner), media_type="image/png")
 
 
@@ -110,6 +109,6 @@ async def image(map_id: MapId, request: Request, server: ServerState, owner: Own
     ),
 )
 async def delete(map_id: MapId, server: ServerState, owner: Owner) -> Response:
-    """It goes for the key that asks; another key that sent the same map keeps it."""
+    """Removes the map for the key that asks. Another key that sent the same map keeps it."""
     await asyncio.to_thread(server.maps.delete, map_id, owner)
     return Response(status_code=204)

@@ -1,4 +1,4 @@
-"""What a step is asked with and answered, in JSON or MessagePack, over HTTP and over a stream."""
+"""Reads the requests of steps and writes problems, in JSON or MessagePack, for HTTP and for streams."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from specshield.service import problems
 from specshield.service.schemas.steps import StepBody, StepRequest
 
 MSGPACK = "application/msgpack"
-MOST_FIELDS = 64  # of what is no step: each unknown field costs an error to be made
+MOST_FIELDS = 64  # of a request that is no step: pydantic makes an error for each unknown field
 
 _json, _msgpack = msgspec.json.Decoder(StepBody), msgspec.msgpack.Decoder(StepBody)
 _any = msgspec.msgpack.Decoder(ext_hook=lambda code, data: bytes(data))
@@ -22,7 +22,7 @@ _pack = msgspec.msgpack.Encoder()
 
 
 def read_step(body: bytes | str, packed: bool) -> StepBody:
-    """Raises InputError, or the branch of it that the field at fault has. packed: MessagePack, not JSON."""
+    """packed: whether `body` is MessagePack. Raises InputError, or its subclass for the wrong field."""
     try:
         return _msgpack.decode(body) if packed and isinstance(body, bytes) else _json.decode(body)
     except (msgspec.MsgspecError, UnicodeError, RecursionError):
@@ -30,7 +30,7 @@ def read_step(body: bytes | str, packed: bool) -> StepBody:
 
 
 def accepts(header: str, kind: str) -> bool:
-    """Whether a header Accept names this kind, and does not refuse it by q=0."""
+    """Whether the header Accept names this media type, and does not refuse it by q=0."""
     return re.search(rf"{kind}(?!\s*;\s*q=0(\.0*)?\s*(,|$))", header) is not None
 
 
@@ -51,7 +51,7 @@ def _parsed(body: bytes | str, packed: bool) -> Any:
 
 
 def _explained(value: Any) -> StepBody:
-    """Why `StepBody` did not take it: pydantic names every field that is wrong."""
+    """Raises an InputError that names every wrong field, by pydantic: msgspec names only the first."""
     if isinstance(value, dict) and len(value) > MOST_FIELDS:
         raise InputError(
             "the body has far more fields than a step", got=len(value), expected="the fields that /docs lists"

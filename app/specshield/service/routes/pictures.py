@@ -1,4 +1,4 @@
-"""Pictures of policies and sessions, by address: SVG that stands alone."""
+"""Pictures of policies and sessions, as SVG files that need nothing else."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def _drawn(said: str, **told: str) -> dict[int | str, dict[str, Any]]:
     tags=["policies"],
     response_class=Response,
     summary="See a policy",
-    responses=_drawn("The floor, and from where the rule can be kept.", _404="No such policy.", **TOO_MUCH),
+    responses=_drawn("The floor, and which starts can keep the rule.", _404="No such policy.", **TOO_MUCH),
 )
 async def policy(policy_id: PolicyId, request: Request, server: ServerState, owner: Owner) -> Response:
-    """The map, the regions of the rule, and from where the rule can still be kept at t = 0: green where some
-    first action has a certified future from every heading that was looked at, red where none has from any.
+    """The map, the regions of the rule, and the starts from which the rule can be kept. A place is green if
+    every heading tried there has an action with a certified future, and red if no heading has one.
 
-    The shield is asked place by place, for some seconds. The longer its decisions take, the further apart
-    the places are, and the picture says how far. The server keeps the pictures asked for last.
+    The shield tries one place after the other, for some seconds. The longer its decisions take, the further
+    apart the places are; the picture says how far. The server keeps the latest pictures.
     """
     found = await asyncio.to_thread(server.policies.find, policy_id, owner)
     drawn = server.pictures.peek(found.id)
     if drawn is None:
         drawn, known = await server.heavy.run(request, "pictures:draw_policy", found.id, owner)
-        if known:  # else it may look otherwise
+        if known:  # otherwise the next picture may show more
             server.pictures.put(found.id, drawn)
     return _shown(request, drawn)
 
@@ -53,8 +53,8 @@ async def policy(policy_id: PolicyId, request: Request, server: ServerState, own
     responses=_drawn("The floor, the way driven, and the certified continuation.", **GONE),
 )
 async def session(key: SessionKey, request: Request, server: ServerState) -> Response:
-    """The map, the regions of the rule, the way driven so far, and where the last decision's certified
-    continuation leads.
+    """The map, the regions of the rule, the way driven so far, and the certified continuation of the last
+    decision.
     """
     seen = await server.sessions.last(key)
     return _shown(request, await server.heavy.run(request, "pictures:draw_session", *seen))

@@ -1,4 +1,4 @@
-"""/v1/policies: the policies pi_phi that certify actions."""
+"""/v1/policies: the policies pi_phi, which propose the futures that certify actions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from specshield.service.library.maps import undeletable
 from specshield.service.library.policies import Record
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyResponse
-from specshield.service.state import TOO_MUCH, Cursor, Limit, Server, ServerState, json_content, problems
+from specshield.service.state import FULL, TOO_MUCH, Cursor, Limit, Server, ServerState, json_body, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
@@ -38,14 +38,14 @@ PolicyId = Annotated[
         _409="`name-taken`: something else of yours has the name.",
         _429="The server keeps no more policies.",
         _503=f"`training-unavailable`: no worker is there to train; the store is away; or {TOO_MUCH['_503']}",
-        _507="`insufficient-storage`: the disk is full, or what you may keep there.",
+        **FULL,
     ),
     openapi_extra={
         "requestBody": {
             "required": True,
-            "description": "What to make, as JSON; or a policy that was made elsewhere, as two files.",
+            "description": "JSON that says what to make, or a policy that was made elsewhere, as two files.",
             "content": {
-                **json_content("PolicyRequest", examples.POLICY),
+                **json_body("PolicyRequest", examples.POLICY),
                 "multipart/form-data": {
                     "schema": {
                         "type": "object",
@@ -61,11 +61,12 @@ PolicyId = Annotated[
     },
 )
 async def create(request: Request, server: ServerState, caller: Caller) -> Any:
-    """The answer comes at once; making the policy takes seconds to minutes: read it to see how far it is.
+    """The answer comes at once. Making the policy takes seconds to minutes: read it to see the progress.
 
-    Policies are immutable. One that is made here is known by the hash of map, task, method, options and seed:
-    the same request again answers the policy there is, and queues it once more if it failed. The hash of one
-    that is sent covers its weights and its card as well, so that its id is never that of a policy made here.
+    Policies are immutable. The id of a policy that is made here is the hash of its map, task, method, options
+    and seed: the same request again is answered with the existing policy, which is queued once more if it
+    failed. The id of a policy that was sent is a hash over its weights and card too, so it is never the id of
+    a policy that is made here.
     """
     body = received(request)
     if is_multipart(body.content_type):
@@ -82,7 +83,7 @@ def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict
     if queued and name not in own and not server.jobs.worker_there(name):
         needs = METHODS.get(name).needs
         installed = f" where {' and '.join(needs)} is installed" if needs else ""
-        told = f"no worker is running that makes policies by {name}"
+        told = f"no running worker makes policies by {name}"
         expected = f"a worker: start one with `specshield worker`{installed}, then ask again"
         raise TrainingUnavailable(told, path="method", got=name, expected=expected)
     record = server.policies.add(asked, caller)
@@ -102,7 +103,7 @@ def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
 
 
 def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
-    card = record.card or {}  # which a stranger may have sent
+    card = record.card or {}  # the card may come from a stranger
     warnings = card.get("warnings", [])
     return {
         **vars(_training(server, record)),
@@ -120,8 +121,8 @@ def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
     "", response_model=PolicyList, summary="List the policies", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """Those that came with the server and your own, in order of name and id. Their `spec` is
-    without `regions` here.
+    """The policies that came with the server and your own, in order of name and id. `spec` has no `regions`
+    here.
     """
 
     def show() -> dict[str, Any]:
@@ -142,7 +143,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
     responses=problems(_404="No such policy.", _503="The store is away."),
 )
 async def read(policy_id: PolicyId, server: ServerState, owner: Owner) -> Any:
-    """How far it is, and what was measured."""
+    """The policy's task, the progress of its making, and what was measured of it."""
     return await asyncio.to_thread(lambda: _show(server, server.policies.find(policy_id, owner), owner))
 
 
@@ -157,8 +158,8 @@ async def read(policy_id: PolicyId, server: ServerState, owner: Owner) -> Any:
     ),
 )
 async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Response:
-    """A training is cancelled, and the policy stays as failed; any other policy is removed, for the key that
-    asks: another key that asked for the same policy keeps it.
+    """A policy that is being made is cancelled, and stays with the status `failed`. Any other policy is
+    removed for the key that asks; another key that asked for the same policy keeps it.
     """
     record = await asyncio.to_thread(server.policies.find, policy_id, owner)
     if record.name is not None:

@@ -1,4 +1,4 @@
-"""/v1/robots: what the robots that came with the server can do."""
+"""/v1/robots: the footprint and the actions of each robot that came with the server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RobotName = Annotated[
 
 @router.get("", response_model=RobotList, summary="List the robots", responses=problems())
 async def list_all() -> Any:
-    """The presets. A robot of your own goes with the policy that is asked for, in the same form."""
+    """The presets. To use a robot of your own, send it in the same form when you ask for a policy."""
     return {"items": [describe(robot) for robot in PRESETS.values()], "next": None}
 
 
@@ -27,7 +27,7 @@ async def list_all() -> Any:
     "/{name}", response_model=RobotResponse, summary="Read a robot", responses=problems(_404="No such robot.")
 )
 async def read(name: RobotName) -> Any:
-    """Its footprint, and what each action does: metres along the heading, then radians counter-clockwise."""
+    """The robot's footprint and actions: metres along the heading, then radians counter-clockwise."""
     if name not in PRESETS:
         expected = f"one of {', '.join(sorted(PRESETS))}"
         raise NotFound(f"there is no robot {name!r}", path="name", got=name, expected=expected)

@@ -47,18 +47,18 @@ GONE = {"_404": "No such session; it may have expired.", "_503": "The store is a
     summary="Begin a session",
     responses=problems(
         _404="No such policy.",
-        _409="`session-exists`: the id is taken.",
+        _409="`session-exists`: you have a session of this id.",
         _429="The server keeps no more sessions.",
         _503="The store is away: try again.",
         _507="`insufficient-storage`: the disk is full.",
     ),
 )
 async def create(request: SessionRequest, server: ServerState, caller: Caller) -> Any:
-    """A session is one episode of one robot: it holds the trajectory, and every answer given.
+    """A session is one episode of one robot. It holds the trajectory and every answer that was given.
 
-    Refused with `invalid-pose` where x_0 is outside the map or in collision, with `infeasible-start` where no
-    action from x_0 has a future that satisfies the specification (unless `allow_infeasible`). It is erased
-    when it has not changed for the server's time to live.
+    The request is refused with `invalid-pose` where x_0 is outside the map or in collision, and with
+    `infeasible-start` where no action from x_0 has a future that satisfies the specification (unless
+    `allow_infeasible`). A session is erased some time after its last change: `expires_at` says when.
     """
     begun = await server.sessions.create(request, caller)
     logs.tell("session begun", session_id=begun["id"], policy_ids=begun["policy_ids"])
@@ -69,9 +69,9 @@ async def create(request: SessionRequest, server: ServerState, caller: Caller) -
     "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The sessions, in order of id; ids that the server makes up are in order of time.
+    """Your sessions in order of id; ids that the server makes are in order of time.
 
-    Their `spec` is without `regions` here, and `robot` is left out; a page may be shorter than `limit`.
+    `spec` has no `regions` here, and `robot` is left out. A page may have fewer items than `limit`.
     """
     found, following = await server.sessions.page(owner, cursor, limit)
     return {"items": found, "next": following}
@@ -81,13 +81,13 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
     "/{session_id}", response_model=SessionResponse, summary="Read a session", responses=problems(**GONE)
 )
 async def read(key: SessionKey, server: ServerState) -> Any:
-    """Where the session stands; `next_t` is the step to ask for."""
+    """The session's settings and its state; `next_t` is the next step to ask for."""
     return await server.sessions.read(key)
 
 
 @router.delete("/{session_id}", status_code=204, summary="Erase a session", responses=problems(**GONE))
 async def delete(key: SessionKey, server: ServerState) -> Response:
-    """Erases the session with its trajectory and its answers."""
+    """Erases the session, its trajectory and its answers."""
     await server.sessions.delete(key)
     logs.tell("session erased")
     return Response(status_code=204)
@@ -115,13 +115,13 @@ async def delete(key: SessionKey, server: ServerState) -> Response:
 async def step(key: SessionKey, body: StepRequest) -> Response:
     """Send where the robot is and what its model proposes; get the closest distribution that keeps the rule.
 
-    `poses` ends with x_t and holds any newest part of the history that joins what the server has. A step that
-    was decided, sent again with equal x_t, logits, signals and main_task_done, returns the stored answer byte
-    for byte, so a lost answer can be asked for again. Nothing is stored on an error.
+    `poses` ends with x_t. It may begin anywhere up to the first pose that the server does not have. A decided
+    step that is sent again with equal x_t, logits, signals and main_task_done gets the stored answer byte for
+    byte, so a lost answer can be asked for again. After an error nothing is stored.
 
     Body and answer may be MessagePack too, by `Content-Type` and `Accept: application/msgpack`. The WebSocket
     `/v1/sessions/{session_id}/stream` takes the same bodies as messages and answers them in order: text
-    frames are JSON, binary frames MessagePack; a problem document is told by its `type` and `status`.
+    frames are JSON, binary frames MessagePack. A problem document is known by its `type` and `status`.
     """
     raise AssertionError("routes/steps.py answers this route")
 
@@ -138,12 +138,12 @@ async def step(key: SessionKey, body: StepRequest) -> Response:
     ),
 )
 async def switch(key: SessionKey, body: SwitchRequest, server: ServerState, caller: Caller) -> Any:
-    """Another rule, map or robot, from step t on; the settings of the session stay.
+    """Brings another rule, map or robot from step t on; the other settings of the session stay.
 
-    Refused with `infeasible-switch` where no action from x_t has a future that satisfies the new rule, with
-    `invalid-pose` where x_t is outside another map, or touches something there or with another footprint. A
-    refusal changes nothing. The same switch sent again is the same switch. `max_steps` grows to what the new
-    rule needs.
+    The request is refused with `infeasible-switch` where no action from x_t has a future that satisfies the
+    new rule, and with `invalid-pose` where x_t is outside the new map or the new footprint touches something
+    there. A refused switch changes nothing, and a switch that is sent again is made once. `max_steps` grows
+    where the new rule needs it.
     """
     made = await server.sessions.switches.make(key, body, caller.name)
     logs.tell("session switched", policy_ids=made["policy_ids"], t=body.t)
@@ -159,7 +159,7 @@ async def switch(key: SessionKey, body: SwitchRequest, server: ServerState, call
     ),
 )
 async def close(key: SessionKey, body: CloseRequest, server: ServerState) -> Any:
-    """Hand in the last states, which no decision follows, and get the verdict. The trajectory stays."""
+    """Send the last states, for which no decision is needed, and get the verdict. The trajectory is kept."""
     closed = await server.sessions.close(key, body)
     logs.tell("session closed", spec_status=closed["spec_status"], next_t=closed["next_t"])
     return closed
@@ -172,8 +172,8 @@ async def close(key: SessionKey, body: CloseRequest, server: ServerState) -> Any
     responses={
         200: {
             "model": Trajectory,
-            "content": {NDJSON: {"schema": {"type": "string", "description": "One item a line."}}},
-            "description": "Every state with the answer given there.",
+            "content": {NDJSON: {"schema": {"type": "string", "description": "One item in each line."}}},
+            "description": "Every state, with the answer that was given there.",
         },
         **problems(**GONE),
     },
@@ -183,10 +183,11 @@ async def trajectory(
     server: ServerState,
     accept: Annotated[str, Header(include_in_schema=False)] = "",
     format: Annotated[
-        Literal["json", "ndjson"] | None, Query(description="Or by `Accept: application/x-ndjson`.")
+        Literal["json", "ndjson"] | None,
+        Query(description="`Accept: application/x-ndjson` asks for NDJSON too."),
     ] = None,
 ) -> Response:
-    """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""
+    """The states x_0 to x_t with the answers, as one JSON object or as one JSON object in each line."""
     lines, rules = await server.sessions.trajectory(key)
     if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
         return StreamingResponse(_each(lines), media_type=NDJSON)
@@ -196,12 +197,12 @@ async def trajectory(
 @router.get(
     "/{session_id}/learned",
     response_class=Response,
-    summary="Read what was learned of the map",
+    summary="Read what the session learned of the map",
     responses={200: {"model": Learned}, **problems(**GONE)},
 )
 async def learned(key: SessionKey, server: ServerState) -> Response:
-    """The cells that are not as on the map, by `occupied` and `free` points, or contacts. A cell is told as
-    in the `data` of an OccupancyGrid: row by row from the map's origin, `row * width + column`.
+    """The cells that differ from the map, as `occupied` and `free` points and contacts have shown. Cells have
+    the indices of an OccupancyGrid's `data`: row by row from the map's origin, `row * width + column`.
     """
     return Response(await server.sessions.learned(key), media_type="application/json")
 
@@ -209,7 +210,7 @@ async def learned(key: SessionKey, server: ServerState) -> Response:
 async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
     for line in lines:
         yield line + b"\n"
-        await asyncio.sleep(0)  # others come between: 10,000 lines take more than a second
+        await asyncio.sleep(0)  # lets other requests run: 10,000 lines take more than a second
 
 
 async def _listed(lines: Iterator[bytes], rules: bytes) -> AsyncIterator[bytes]:

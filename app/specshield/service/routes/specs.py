@@ -1,4 +1,4 @@
-"""/v1/specs: formulas before they are used."""
+"""/v1/specs: checks formulas before they are used."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from specshield.service import examples
 from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
 from specshield.service.schemas.specs import SpecResponse
-from specshield.service.state import TOO_MUCH, ServerState, json_content, problems
+from specshield.service.state import TOO_MUCH, ServerState, json_body, problems
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
-SHORT = 16 << 10  # [bytes] of a body that is read in a few ms
+SHORT = 16 << 10  # [bytes]; a body of this size is read within a few ms
 
 
 @router.post(
@@ -23,14 +23,14 @@ SHORT = 16 << 10  # [bytes] of a body that is read in a few ms
     summary="Check a formula",
     responses=problems(_404="No such map.", **TOO_MUCH),
     openapi_extra={
-        "requestBody": {"required": True, "content": json_content("SpecRequest", examples.SPEC_REQUEST)}
+        "requestBody": {"required": True, "content": json_body("SpecRequest", examples.SPEC_REQUEST)}
     },
 )
 async def validate(request: Request, server: ServerState, owner: Owner) -> Any:
     """Parse a formula and give its canonical text, its horizon and its names.
 
-    A formula that does not parse is answered with the `position` of the error in the text. Names are checked
-    where `regions`, `signals` or `map_id` say which there are; `x`, `y` [m] and `theta` [rad] always are.
+    For a formula that does not parse, the problem has the `position` of the error in the text. Names are
+    checked where `regions`, `signals` or `map_id` are given; `x`, `y` [m] and `theta` [rad] are always known.
     """
     content = await request.body()
     if len(content) > SHORT:

@@ -1,6 +1,6 @@
-"""POST /v1/sessions/{id}/steps, as plain ASGI: FastAPI's way to a route and back costs more than a decision.
+"""POST /v1/sessions/{id}/steps as plain ASGI, since FastAPI's own handling takes longer than a decision.
 
-`routes/sessions.py` describes the route. The middlewares stand around this one as around all others.
+`routes/sessions.py` describes the route for OpenAPI. The middlewares apply to it as to all other routes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PACKED, JSON = MSGPACK.encode(), b"application/json"
 
 
 class StepRoute:
-    """Answers the steps; the rest goes on to `app`."""
+    """Answers the steps, and passes all other requests on to `app`."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -37,7 +37,7 @@ class StepRoute:
             return
         scope["route"], scope["path_params"] = ROUTE, {"session_id": found[1]}
         headers = dict(scope["headers"])
-        body = (await receive())["body"]  # in one piece, and of a caller who is there: bounds/bodies.py
+        body = (await receive())["body"]  # the whole body: bounds/bodies.py has waited for it
         try:
             packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
             request = read_step(body, packed)

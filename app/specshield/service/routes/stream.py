@@ -1,8 +1,8 @@
 """The WebSocket /v1/sessions/{id}/stream: steps as messages, answered in order.
 
-A text frame is a step in JSON, a binary frame one in MessagePack. The answer comes in the same form, and so
-does a problem document, which is told by its `type` and `status`. A session has one step at a time, so a
-caller's further messages wait in the connection, which holds a few and then takes no more from that caller.
+A text frame is a step in JSON, a binary frame a step in MessagePack. The answer has the same form, and so has
+a problem document, which is known by its `type` and `status`. A session decides one step at a time: further
+messages of the caller wait in the connection, which holds a few and then reads no more.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from specshield.service.watch import logs
 
 PATH = re.compile(rf"/v1/sessions/({ID})/stream")
 ROUTE = "/v1/sessions/{session_id}/stream"
-GOING_AWAY, REFUSED = 1001, 1008  # RFC 6455: the server goes down; it may not go on by the server's policy
+GOING_AWAY, REFUSED = 1001, 1008  # codes of RFC 6455: the server stops; a policy of the server is violated
 log = logging.getLogger("specshield")
 
 
 class StreamRoute:
-    """Answers the streams; the rest goes on to `app`."""
+    """Answers the streams, and passes everything else on to `app`."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -76,7 +76,7 @@ class _Stream:
         self._closing: asyncio.Future[None] | None = None
 
     async def serve(self, receive: Receive) -> None:
-        """Until the caller leaves, or `stop`."""
+        """Answers messages until the caller leaves or `stop` is called."""
         while (message := await receive())["type"] == "websocket.receive" and self._closing is None:
             self._busy = True
             text, content = message.get("text"), message.get("bytes") or b""
@@ -94,7 +94,7 @@ class _Stream:
             await self._closing
 
     def stop(self, code: int = GOING_AWAY, reason: str = "the server stops") -> None:
-        """After the step that is being decided, if one is."""
+        """Closes the stream, after the step that is being decided if there is one."""
         if self._ending is None:
             self._ending = {"type": "websocket.close", "code": code, "reason": reason}
             if not self._busy:
@@ -102,13 +102,13 @@ class _Stream:
 
     async def stop_when_refused(self) -> None:
         await self._server.keys.until_refused(self._authorization)
-        self.stop(REFUSED, "the API key is not one of this server's any more")
+        self.stop(REFUSED, "the API key is no longer one of this server's")
 
     async def _answer(self, content: bytes | str, packed: bool) -> tuple[int, bytes]:
-        """The status that it has over HTTP, and the message."""
+        """The status that the answer has over HTTP, and the answer as a message."""
         error: SpecshieldError
         try:
-            api_key = await self._server.keys.check(self._authorization)  # it may have been revoked
+            api_key = await self._server.keys.check(self._authorization)  # the key may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
             request = read_step(content, packed)
             answer = await self._server.sessions.steps.decide(self._key, request, defaultdict(float))

@@ -1,4 +1,4 @@
-"""Whether the server lives, whether it is ready, and its metrics."""
+"""/livez, /readyz and /metrics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ router = APIRouter(tags=["system"])
 
 @router.get("/livez", summary="Is it alive?")
 async def livez() -> Health:
-    """Whether the process answers at all. It asks neither the store nor the kernels."""
+    """Answers as long as the process runs. It looks neither at the store nor at the kernels."""
     return Health(status="ok")
 
 
@@ -21,15 +21,15 @@ async def livez() -> Health:
     "/readyz",
     summary="Is it ready?",
     responses=problems(
-        _503="`starting`: it says how far it is; `stopping`: it was told to stop; or the store is away."
+        _503="`starting`, with the progress; `stopping`: the server was told to stop; or the store is away."
     ),
 )
 async def readyz(server: ServerState) -> Health:
-    """Whether it can decide: the store answers, and the kernels are compiled.
+    """Whether the server can decide: the store answers, and the kernels are compiled.
 
-    The first start of an installation compiles them, in about a minute; `kernels` says how many of how
-    many are done. Until then every path under /v1 answers 503 `starting`, with Retry-After. A server that was
-    told to stop says so here first, and answers everything else until it stops.
+    The first start of an installation compiles the kernels, in about a minute; `kernels` says how many are
+    compiled. Until then every path under /v1 answers 503 `starting`, with Retry-After. A server that was told
+    to stop answers 503 here at once, and answers everything else until it stops.
     """
     await server.store.ping()
     problem = server.startup.problem()
