@@ -1,1 +1,1 @@
-"""Sessions: what is stored of an episode, and what a request does to it."""
+"""Sessions: what the store holds of an episode, and what each request changes in it."""

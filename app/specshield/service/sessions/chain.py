@@ -1,7 +1,7 @@
-"""A session's record as a file: all that its chain of steps covers, and the hash that seals it (pure).
+"""A session's record as a file: its config, poses, signals and step records, sealed by a hash (pure).
 
-What record.py says of one step holds of the file: each record holds the hash of all before it. The `seal` is
-the same for what follows the last record. A file comes from strangers: `read` bounds it, then checks it.
+As record.py says, each step record holds the hash of all that came before it. The `seal` is the hash that a
+further step record would hold. Since a file may come from strangers, `read` bounds its size and checks it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MEDIA_TYPE = "application/vnd.specshield.record"
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """config, rows: as stored (rules.py). steps: the record of each, b"" where passed over. seal: SHA-256."""
+    """config, rows: as stored (rules.py). steps: each step's record, b"" if it has none. seal: SHA-256."""
 
     format: Literal["specshield-record-1"]
     config: bytes
@@ -42,7 +42,7 @@ class Spec(msgspec.Struct, frozen=True):
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """What a session's config has to hold to be decided again; there is more in it."""
+    """The members of a session's config that are needed to make its decisions again."""
 
     id: str
     policy_ids: list[str]
@@ -74,9 +74,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Chain(NamedTuple):
-    """A record whose chain is whole. rows [n, 3 + signals]; steps: b"" where passed over. seal: in hex.
-
-    configs: one a rule. names: of the signals, for each rule: those of the rows' columns that there were.
+    """A record whose chain was checked. configs: one for each rule. names: for each rule, the signals of the
+    columns that the rows had by then. rows [n, 3 + signals]. steps: b"" without a decision. seal: in hex.
     """
 
     configs: Sequence[Config]
@@ -95,7 +94,7 @@ class Chain(NamedTuple):
 
 
 def pack(config: bytes, rows: bytes, steps: Sequence[bytes]) -> tuple[bytes, str]:
-    """The file, and its seal in hex. Rows: no more than the session has."""
+    """The file, and its seal in hex. rows: exactly those that the session has."""
     lines = config.split(b"\n")
     configs = [msgspec.json.decode(line, type=Config) for line in lines]
     held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(_names(configs)[-1]))
@@ -108,8 +107,8 @@ def pack(config: bytes, rows: bytes, steps: Sequence[bytes]) -> tuple[bytes, str
 
 
 def read(content: bytes) -> Chain:
-    """Raises InputError where the file is no record, or the chain is broken. `t` in its details: the step at
-    fault, None where it is the file.
+    """Raises InputError where the file is no record, or its chain is broken. The error's `t` is the first
+    wrong step, None where the file as a whole is wrong.
     """
     if len(content) > LARGEST:
         raise _broken(None, "the file is too large", f"at most {LARGEST} bytes")
@@ -120,11 +119,12 @@ def read(content: bytes) -> Chain:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         raise _broken(None, "the file is no record of a session, or not all of one", WHERE) from None
     if msgspec.msgpack.encode(file) != content:
-        raise _broken(None, "the file is not written as a server writes it", "every byte as it was")
+        raise _broken(None, "the file was changed: a server would write it otherwise", "the original bytes")
     names = _names(configs)
     rows = _rows(file.rows, 3 + len(names[-1]))
     if len(file.steps) > len(rows) or not all(file.steps[-1:]):  # no hash covers an empty one at the end
-        raise _broken(None, f"{len(file.steps)} steps and {len(rows)} poses", "as many, the last not empty")
+        told = f"there are {len(file.steps)} steps for {len(rows)} poses, or the last step is empty"
+        raise _broken(None, told, "no more steps than poses, the last not empty")
     _check_switches(configs, names, rows)
     last, begin, rule = record.digest(lines[0]), 0, 0
     for t in range(len(rows) + 1):
@@ -132,22 +132,22 @@ def read(content: bytes) -> Chain:
             linked = record.link(last, rows[begin:t, : 3 + len(names[rule])])
             rule += 1
             if configs[rule].before != linked.hex():
-                raise _broken(t, "the chain is broken: something before this switch is not as it was", None)
+                raise _broken(t, "the chain is broken: something before this switch was changed", None)
             last, begin = record.digest(lines[rule]), t
         step = file.steps[t] if t < len(file.steps) else b""
         if not step:
             continue
         found = _decode(t, step)
         if found.before != record.link(last, rows[begin : t + 1, : 3 + len(names[rule])]):
-            raise _broken(t, "the chain is broken: something before this step is not as it was", None)
+            raise _broken(t, "the chain is broken: something before this step was changed", None)
         last, begin = record.digest(step), t + 1
     if file.seal != record.link(last, rows[begin:]):
-        raise _broken(None, "the seal is not that of the last record and of what follows it", None)
+        raise _broken(None, "the seal does not fit the last record and what follows it", None)
     return Chain(configs, names, rows, file.steps, file.seal.hex())
 
 
 def _names(configs: Sequence[Config]) -> list[list[str]]:
-    """The signals of the rows, by column, as each rule found them with its own."""
+    """For each rule, the signals of the rows' columns, in order, up to those that this rule added."""
     names, found = list[str](), list[list[str]]()
     for config in configs:
         names = [*names, *added(names, config.spec.signals)]
@@ -156,13 +156,15 @@ def _names(configs: Sequence[Config]) -> list[list[str]]:
 
 
 def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows: Floats) -> None:
-    """That rules follow each other in time, and that a column holds its first value until its rule begins."""
+    """Raises InputError unless the rules follow each other in time, and each column that a rule added holds
+    the signal's initial value until that rule begins.
+    """
     if configs[0].begins or configs[0].origin or configs[0].clock == "keep":
         raise _broken(0, "the first rule does not begin with the session", None)
     for i in range(1, len(configs)):
         config, old = configs[i], configs[i - 1]
         if not old.begins <= config.begins <= len(rows):
-            raise _broken(config.begins, "a rule begins out of its turn", None)
+            raise _broken(config.begins, "a rule begins before the one that it follows, or too late", None)
         if config.origin != (config.begins if config.clock == "restart" else old.origin):
             raise _broken(config.begins, f"the origin of a rule is not what `{config.clock}` means", None)
         first, known = rows[: config.begins, : 3 + len(names[i])], names[i - 1]

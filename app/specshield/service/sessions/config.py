@@ -1,4 +1,4 @@
-"""A session's settings, as its stored config holds them and as a shield takes them (pure)."""
+"""Converts a session's settings between the request, the stored config and the shield's `Config` (pure)."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from specshield.shield.decision import Config
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task
 
-# The settings that are asked for and stored as `Config` has them; an uncertainty is told in another form.
+# The settings that request, stored config and `Config` hold in the same form; `uncertainty` has others.
 ALIKE = [
     each.name for each in fields(Config) if each.name in SessionRequest.model_fields.keys() - {"uncertainty"}
 ]
-ANY_SIGNAL = "any_signal"  # is not asked for by itself: it goes with what is taken of the world
+ANY_SIGNAL = "any_signal"  # no request has it: it follows from `uncertainty`
 
 
 def settings_of(config: Mapping[str, Any]) -> Config:
-    """Of a stored config. One from before a setting existed has the paper's default for it.
+    """The settings of a stored config. A config that is older than a setting has the paper's default for it.
 
-    The core counts steps from where the rule's windows begin. So does the draw of actions: each origin has a
-    seed of its own.
+    The core counts steps from the rule's origin. So the last step is moved, and the seed is another one: else
+    the draws of actions would be repeated from each origin on.
     """
     alike = {name: config[name] for name in (*ALIKE, ANY_SIGNAL) if name in config}
     if origin := config.get("origin", 0):
@@ -34,14 +34,14 @@ def settings_of(config: Mapping[str, Any]) -> Config:
 
 
 def asked_for(request: SessionRequest) -> Config:
-    """What a request asks for. Raises InputError for settings that cannot be had."""
+    """The settings of a request. Raises InputError for settings that do not go together."""
     alike = {name: getattr(request, name) for name in ALIKE}
     told = _told(request.uncertainty)
     return Config(**alike, uncertainty=_uncertainty(told), any_signal=told != "none")
 
 
 def asked_by(policy_ids: Sequence[str], about: Description, task: Task) -> dict[str, Any]:
-    """What the config holds of the policies, and of the task that they are for."""
+    """The members of a config that come from the policies and from their task."""
     return {
         "policy_ids": list(policy_ids),
         "map_id": about.map_id,
@@ -58,7 +58,7 @@ def asked_by(policy_ids: Sequence[str], about: Description, task: Task) -> dict[
 
 
 def stored(settings: Config, request: SessionRequest) -> dict[str, Any]:
-    """The settings as the config holds them."""
+    """The members of a config that hold the settings."""
     alike = {name: getattr(settings, name) for name in (*ALIKE, ANY_SIGNAL)}
     return {**alike, "uncertainty": _told(request.uncertainty)}
 

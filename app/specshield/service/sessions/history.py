@@ -1,4 +1,4 @@
-"""Joining what a caller sends of a trajectory with what the server has of it (pure)."""
+"""Joins the poses that a caller sends with those that the server has (pure)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ TOLERANCE = 1e-6  # m or rad
 
 
 def join(stored: Floats, t: int, poses: Floats) -> Floats:
-    """The poses to add to `stored` so that it reaches step t; empty where it does already.
+    """The poses to add to `stored` so that it reaches step t; none if it does already.
 
     stored: [n, 3], x_0 .. x_{n-1}, in [m, m, rad].  poses: [k, 3], x_{t-k+1} .. x_t.
-    What both hold has to agree within `TOLERANCE` (theta modulo 2 pi); the stored value is the one kept.
+    Poses in both have to agree within `TOLERANCE` (theta modulo 2 pi); the stored ones are kept.
     Raises HistoryGap (`expected_t`: the first pose that is missing), HistoryConflict, PoseError.
     """
     length = len(stored)
@@ -50,13 +50,13 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
 
 
 def gap(told: str, got: int | None, length: int, t: int) -> HistoryGap:
-    """The error where the server has poses up to before step `length`, and those up to t do not follow."""
+    """The error for poses up to step t that leave a gap after those of the server, x_0 .. x_{length-1}."""
     expected = f"poses from step {length} or earlier up to step {t}"
     return HistoryGap(told, path="poses", got=got, expected=expected, expected_t=length)
 
 
 def agree(a: Floats, b: Floats) -> Bools:
-    """Element by element, for [..., 3] poses: equal within `TOLERANCE`, headings modulo 2 pi."""
+    """For each element of two arrays of poses [..., 3]: equal within `TOLERANCE`, headings modulo 2 pi."""
     difference: Any = np.abs(a - b)
     turn = np.mod(difference[..., 2], 2 * math.pi)
     difference[..., 2] = np.minimum(turn, 2 * math.pi - turn)

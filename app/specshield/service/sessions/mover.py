@@ -1,7 +1,8 @@
-"""Moves what has ended, or been idle for long, from the store to the archive; erases there what has expired.
+"""Moves sessions that have ended, or have been idle for long, from the store to the archive, and erases
+expired sessions there.
 
-Every server has a mover, and of all that share a store one moves at a time. Nothing rests on that: two that
-move the same session write the same file.
+Every server has a mover; of the servers that share a store one moves at a time. Correctness does not depend
+on that: two movers of the same session write the same file.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
 
-BATCH = 1000  # ids, or files, that are looked at in one go
-AT_ONCE = 4  # sessions that move side by side; each waits for its file to be on the disk
-ENDED = 60  # [s] for which a session that has ended stays, so that its last answers can be asked for again
+BATCH = 1000  # ids, or files, that are looked at together
+AT_ONCE = 4  # sessions that are moved at the same time; each waits for its file to be on the disk
+ENDED = 60  # [s] that an ended session stays in the store, so that its last answers can be asked for again
 EVERY = 10.0  # [s] between two looks at the store, at most
 SWEEP_EVERY = 3600  # [s] between two looks at all files, at most
 log = logging.getLogger("specshield")
 
 
 class Mover:
-    """Where the archive is full nothing moves, and `ArchivingStore.full` tells."""
+    """While the archive is full, no session is moved, and `ArchivingStore.full` is true."""
 
     def __init__(self, store: ArchivingStore, settings: Settings) -> None:
         self._store, self._after, self._ttl = store, settings.archive_after, settings.session_ttl
@@ -34,7 +35,7 @@ class Mover:
         self._me = secrets.token_hex(8)
 
     async def run(self) -> None:
-        """Until it is cancelled."""
+        """Moves and sweeps until it is cancelled."""
         every, sweep_every = min(EVERY, self._ended), min(SWEEP_EVERY, self._ttl)
         while True:
             try:
@@ -46,12 +47,12 @@ class Mover:
                     await self.move()
             except SpecshieldError as error:
                 log.warning("nothing moves to the archive now: %s", error)
-            except Exception:  # the next turn may fare better; without the mover the store would only grow
+            except Exception:  # the next turn may succeed; without a mover the store would only grow
                 log.exception("nothing moves to the archive now")
             await asyncio.sleep(every)
 
     async def move(self) -> int:
-        """Moves what is to be moved; how many sessions that were."""
+        """Moves the sessions that are due, and returns their number."""
         moved, after = 0, None
         while True:
             idle, after = await self._store.idle(after, BATCH, self._ended)
@@ -69,7 +70,7 @@ class Mover:
             return await self._store.put_away(id, State.of(dump.state).expires_at, dump)
 
     async def sweep(self) -> int:
-        """Removes what has expired and what a newer file replaces; the bytes of what is left."""
+        """Removes files that have expired and those that a newer one replaces. Returns the bytes left."""
         files, kept, total = self._store.archive.sizes(), None, 0
         while batch := await self._store.in_thread(lambda: list(islice(files, BATCH))):
             for entry, size in batch:

@@ -1,4 +1,4 @@
-"""How a record holds numbers in few bytes: a table of the actions, and lists with values left out."""
+"""Stores the numbers of a record in few bytes: a table of the actions, and lists without a frequent value."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
 
 
 def _known(row: Floats) -> Floats:
-    """[6]: numbers that need no room of their own. Where an action does not turn, theta is that of x_t."""
+    """The numbers [6] that a record does not store: those of x_t, which next poses often share, 0, 1, NaN."""
     return np.array([*row[:3].tolist(), 0.0, 1.0, math.nan], "<f8")
 
 
 def pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
-    """`rows`, `table` and `pool` of a record. actions [A, 5]: J, rho, x, y, theta; NaN stands for null. row:
-    the stored one of the step.
+    """The members `rows`, `table` and `pool` of a record. actions [A, 5]: J, rho, x, y, theta; NaN for null.
+    row: the session's row of this step.
     """
     known, size = _known(row), actions.size
     rows, table, pool = np.empty(len(actions), np.uint8), np.empty(size, np.uint16), np.empty(size)
@@ -30,8 +30,8 @@ def pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
 
 @kernel
 def _take_apart(actions: Floats, known: Floats, rows: Bytes, table: Codes, pool: Floats) -> tuple[int, int]:
-    """Writes rows [A], table and pool as `StepRecord` has them; how many distinct rows, and numbers in the
-    pool, there are. Numbers are told apart by their bits.
+    """Writes rows [A], table and pool as `StepRecord` has them. Returns the number of distinct rows, and of
+    numbers in the pool. Numbers are equal if all their bits are.
     """
     words, seen, fresh = actions.view(np.int64), known.view(np.int64), pool.view(np.int64)
     firsts, distinct, count = np.empty(len(words), np.int64), 0, 0
@@ -61,7 +61,7 @@ def _take_apart(actions: Floats, known: Floats, rows: Bytes, table: Codes, pool:
 
 
 def unpack_table(rows: bytes, table: bytes, pool: bytes, row: Floats) -> Floats:
-    """`pack_table` undone: [A, 5]."""
+    """The `actions` [A, 5] that `pack_table` was given."""
     words = np.concatenate([_known(row), np.frombuffer(pool, "<f8")])
     wide = "<u1" if len(words) <= 256 else "<u2"
     distinct = words[np.frombuffer(table, wide)].reshape(-1, COLUMNS)
@@ -70,8 +70,8 @@ def unpack_table(rows: bytes, table: bytes, pool: bytes, row: Floats) -> Floats:
 
 
 def sparse(values: Floats, absent: float, shortens: bool) -> bytes:
-    """float64 without the values that are `absent`: a bit for each value, then those whose bit is set. With
-    `shortens` as float32, where that loses nothing.
+    """The values without those that equal `absent`: one bit for each value says whether it follows, as
+    float64 or, with `shortens` and where that loses nothing, as float32.
     """
     bits, kept = np.zeros((len(values) + 7) // 8, np.uint8), np.empty(len(values))
     count, short = _keep(values, absent, bits, kept)
@@ -80,8 +80,8 @@ def sparse(values: Floats, absent: float, shortens: bool) -> bytes:
 
 @kernel
 def _keep(values: Floats, absent: float, bits: Bytes, kept: Floats) -> tuple[int, bool]:
-    """Sets the bits of the values that are not `absent`, and writes those into `kept`; how many there are,
-    and whether float32 holds them all.
+    """Sets the bits of the values that are not `absent`, and writes these values into `kept`. Returns their
+    number, and whether float32 can hold them all.
     """
     count, short = 0, True
     for i in range(len(values)):
@@ -94,7 +94,7 @@ def _keep(values: Floats, absent: float, bits: Bytes, kept: Floats) -> tuple[int
 
 
 def full(content: bytes, size: int, absent: float, shortens: bool) -> Floats:
-    """`sparse` undone."""
+    """The `values` that `sparse` was given."""
     head = (size + 7) // 8
     there = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
     values = np.full(size, absent)

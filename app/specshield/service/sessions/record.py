@@ -1,14 +1,14 @@
-"""The record of a decided step: what was asked, what was answered, and the hash of what came before (pure).
+"""The record of a decided step: its request, its answer, and the hash of all that came before (pure).
 
-A record is opaque bytes to the store and the archive. With the stored row of its step (pose and signals) it
-gives the answer again, byte for byte, and what is needed to decide the step again. All numbers are float64,
-to the last bit.
+A record is opaque bytes to the store and the archive. Together with the session's row of the step (pose and
+signals) it gives the answer again, byte for byte, and all that is needed to make the decision again. Its
+numbers are float64, to the last bit.
 
-The records of a session are a chain. `before` is `link(SHA-256 of the previous record, rows)`, where `rows`
-are those from the step after the previous record's up to this step's; for the first record it is
-`link(SHA-256 of the config, x_0 .. x_t)`. A switch to another rule is a link of the same kind: its line of
-the config holds the hash of what came before, and the next record that of the line. So none of config, poses,
-signals and records can be changed afterwards without its being seen.
+The records of a session form a chain. `before` is `link(SHA-256 of the previous record, rows)`, with the rows
+from the step after the previous record's up to this step's. For the first record it is `link(SHA-256 of the
+config, x_0 .. x_t)`. A switch to another rule is a link too: its line of the config holds the hash of what
+came before, and the next record the hash of that line. So no later change of config, poses, signals or
+records stays unseen.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOST_SIGNALS = 64  # columns of a session: MessagePack's integers have 64 bits
 
 
 class Asked(NamedTuple):
-    """What a caller sent with a step. pose: x_t. logits [A], -inf for null; occupied, free [n, 2]: points."""
+    """What a caller sent with a step. pose: x_t. logits [A]: -inf for null. occupied, free: points [n, 2]."""
 
     pose: Sequence[float]
     logits: Floats | None
@@ -51,17 +51,16 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
 
     format: `FORMAT`, of records of this layout. before: SHA-256, as `link` has it.
 
-    Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: the
-    finite ones, as `sparse` has them. signals: which were sent, bit i for column i of the row's signals;
-    their values are there. all_witnesses: whether one was asked for each action.
+    Of the request: pose is x_t as it was sent, three float64, None where it equals the stored one bit by bit.
+    logits: as `sparse` writes them. signals: bit i is set if the signal of column i was sent; the row has its
+    value. all_witnesses: whether a witness was asked for each action. occupied, free: the points that were
+    sent, two float64 each. explain: whether explanations were asked for. tables: the digest of the learned
+    map that the policies' tables were made for; None: the policies' own tables.
 
-    occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
-    tables: which the policies went by, as the digest of the map they were made for; None: their own.
-
-    Answered: distribution, as `sparse` has it. rows: for each action, which distinct row of the table is
-    its own. table: each distinct row's J, rho and next pose (x, y, theta), as indices into `pool`, in one
-    byte each, or two where the pool is larger. pool: float64 beside the six that every step has
-    (packing.py). Actions are one byte each: an action set has at most 256.
+    Of the answer: distribution, as `sparse` writes it. rows: for each action, the index of its row among the
+    distinct rows of `table`. table: for each distinct row J, rho and the next pose (x, y, theta), as indices
+    into the numbers that every record knows (packing.py), followed by `pool`: one byte each, or two where one
+    does not suffice. Actions are one byte each: an action set has at most 256.
     """
 
     format: int
@@ -101,7 +100,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     any_signal: bool | None = None
 
     def asked(self, row: Floats, names: Sequence[str]) -> Asked:
-        """What was sent with the step. row: the stored one; names: of its signals, by column."""
+        """What was sent with the step. row: the session's row of it; names: of its signals, by column."""
         pose = (row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")).tolist()
         signals = {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
         logits, occupied, free = self.logits_sent(), _points(self.occupied), _points(self.free)
@@ -118,7 +117,7 @@ def _points(sent: bytes | None) -> Floats | None:
     return None if sent is None else np.frombuffer(sent, "<f8").reshape(-1, 2)
 
 
-# The members that a decision, its record and its answer hold in one form, and those that they do not.
+# The members that a decision, its record and its answer hold in different forms, and those in the same form.
 OTHERWISE = {"distribution", "residual", "witness", "witnesses", "any_signal", "explanations"}
 ALIKE = [name for name in StepRecord.__struct_fields__ if name in {*StepAnswer.__struct_fields__} - OTHERWISE]
 _values = attrgetter(*ALIKE)
@@ -149,7 +148,7 @@ def digest(content: bytes) -> bytes:
 
 
 def link(last: bytes, rows: Floats) -> bytes:
-    """SHA-256 of `last`, the digest of the previous record or of the config, and of the rows since then."""
+    """SHA-256 over `last`, the digest of the previous record or of the config, and the rows since then."""
     return hashlib.sha256(last + rows.astype("<f8", copy=False).tobytes()).digest()
 
 
@@ -161,8 +160,8 @@ def make(
     before: bytes,
     tables: bytes | None = None,
 ) -> StepRecord:
-    """The record of a decision. row: the stored one of its step; names: of its signals, by column. before,
-    tables: as the record has them.
+    """The record of a decision. row: the session's row of its step; names: of its signals, by column. before,
+    tables: members of the record.
     """
     pose, logits, main_task_done, signals, all_witnesses, occupied, free, explain = asked
     sent = struct.pack("<3d", *pose)
@@ -197,7 +196,7 @@ def make(
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
-    """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
+    """The caller's answer, made from the decision. `answer` takes three times as long to make the same."""
     return _answer(
         decision,
         all_witnesses,
@@ -211,7 +210,7 @@ def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
 
 
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
-    """What the caller was answered. row: the stored one of this step; names: of the actions."""
+    """The caller's answer, made from the record. row: the session's row of it. names: of the actions."""
     table = unpack_table(record.rows, record.table, record.pool, row)
     return _answer(
         record,
@@ -231,8 +230,8 @@ def _answer(
     explanations: tuple[Explanation | None, ...] | None,
     **own: Any,
 ) -> StepAnswer:
-    """Of a decision or its record; own: the members that the two hold in different forms. explanations: None
-    where they were not asked for.
+    """The answer of a decision or of its record. own: the members that these two hold in different forms.
+    explanations: None if they were not asked for.
     """
     if made.any_signal is not None:
         own["any_signal"] = made.any_signal

@@ -1,4 +1,4 @@
-"""A session as it is stored, and what a request may ask of it (pure)."""
+"""A session as it was read from the store, and the checks of what a request may ask of it (pure)."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield
 
 F = TypeVar("F")
-RACES = 10  # writes lost to others before a caller is told so
-# Bytes that a session takes beside its state and its rows: its objects, and its parsed rules for each byte of
-# their JSON. tracemalloc found 3,000, and 5 to 10, with rules of 1 to 200 kB.
+RACES = 10  # tries to write a change: another writer may come first each time
+# Bytes of memory that a session takes beside its state and its rows: its objects, and for each byte of its
+# rules' JSON their parsed form. tracemalloc found 3,000, and 5 to 10, with rules of 1 to 200 kB.
 OBJECTS, PARSED = 3_000, 10
 
 
 class Session(NamedTuple):
-    """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
+    """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the samples of the signals.
 
-    rules: the config of each rule that it has had, the one in force last. settings: of that one.
-    signal_names: as in the rows. weight: of the rules, held: of the state, as they are stored [bytes].
+    rules: the config of each rule so far; the last one is in force. settings: those of the last one.
+    signal_names: by column. weight, held: bytes of the rules and of the state in the store.
     """
 
     rules: Sequence[Mapping[str, Any]]
@@ -64,12 +64,12 @@ class Session(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of memory, about."""
+        """About how many bytes of memory the session takes."""
         return OBJECTS + PARSED * self.weight + self.held + self.rows.nbytes
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """Of the rule that is in force."""
+        """The config of the rule that is in force."""
         return self.rules[-1]
 
     @property
@@ -82,7 +82,7 @@ class Session(NamedTuple):
 
     @property
     def since(self) -> Floats:
-        """The rows that the rule in force looks at."""
+        """The rows from the origin of the rule in force on, which are its history."""
         return self.rows[ruled.origin(self.config) :]
 
     def extended(self, t: int, poses: Floats, signals: Mapping[str, float]) -> Session:
@@ -97,14 +97,14 @@ class Session(NamedTuple):
         return self._replace(rows=rows)
 
     def added(self, stored: int) -> tuple[bytes, int]:
-        """The rows that a change has to write, and the byte where they begin: only what is new, and row 0
-        once more with the first step, which brings its signals. stored: how many rows the store has.
+        """The rows that a change has to write, and the byte where they begin: the new rows, or row 0 once
+        more with the first step, which brings its signals. stored: the number of rows in the store.
         """
         first = min(stored, len(self.rows) - 1)
         return pack(self.rows[first:]), first * 8 * self.rows.shape[1]
 
     def check_step(self, request: StepBody) -> None:
-        """Raises what is wrong with asking for a step that was not decided before."""
+        """Raises what keeps a step that was not decided before from being decided now."""
         self.check_ahead(request.t, f"step {request.t} was passed over and can no longer be decided")
         check_last(request.t, self.config["max_steps"])
         check_main_task(self.state.main_task_done, request.main_task_done)
@@ -118,7 +118,7 @@ class Session(NamedTuple):
             raise StepConflict(otherwise, path="t", got=t, expected=f"{ahead} or later", expected_t=ahead)
 
     def over(self, t: int) -> SessionFinished:
-        """The error of a step that is asked for after the end."""
+        """The error for a step that is asked for after the session's end."""
         told = f"session {self.id!r} is over: no further step is decided"
         return SessionFinished(told, path="t", got=t, expected="a step already decided, to read it again")
 
@@ -141,14 +141,14 @@ class Session(NamedTuple):
         return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)]["actions"])
 
     def learned(self) -> bytes:
-        """The cells that its own map has otherwise than the map, as JSON."""
+        """The cells in which the session's own map differs from the map, as JSON."""
         known = self.state.learned
         about = {"t": self.state.next_t - 1, "map_id": self.config["map_id"], "map_revision": known.revision}
         occupied, free = (known.cell[known.occupied == held].tolist() for held in (True, False))
         return files.to_json({**about, "occupied": occupied, "free": free})
 
     def lines(self, steps: Sequence[bytes]) -> Iterator[bytes]:
-        """One JSON object a step: t, pose, signals, which rule held, the logits sent, the answer given."""
+        """One JSON object for each step: t, pose, signals, index of the rule, the logits sent, the answer."""
         for t, row in enumerate(self.rows):
             held, rule = row.tolist(), ruled.at(self.rules, t)
             config, values = self.rules[rule], dict(zip(self.signal_names, held[3:], strict=True))
@@ -161,7 +161,7 @@ class Session(NamedTuple):
             yield head[:-1] + b',"logits":' + logits + b',"decision":' + told + b"}"
 
 
-# What others are not told of a config.
+# The members of a config that the contract does not show, or shows in another form.
 INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way", "version")
 
 
@@ -179,15 +179,15 @@ def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]
 
 
 def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
-    """The policies of the rule in force, and of each before it whose last step is still to come: what it says
-    of that is worked out on its map.
+    """The policies that the session still needs: those of the rule in force, and those of earlier rules whose
+    verdicts are still open, since their maps are needed for these.
     """
     waiting = [a for a, b in pairwise(rules) if ruled.begins(b) >= state.next_t]
     return {id for config in [*waiting, rules[-1]] for id in config["policy_ids"]}
 
 
 def check_last(t: int, last: int) -> None:
-    """last: the session's. Raises InputError for a step that comes after it."""
+    """Raises InputError for a step after `last`, the session's last one."""
     if t > last:
         raise InputError(f"step {t} is past max_steps", path="t", got=t, expected=f"at most {last}")
 
@@ -224,8 +224,8 @@ def decide(
     before: bytes,
     tables: bytes | None,
 ) -> tuple[Decision, StepRecord]:
-    """The decision of step t, and its record. since: the rows that the rule looks at, the last that of x_t;
-    names: of their signals, by column. carry: of the decision before. before, tables: as the record has them.
+    """The decision of step t, and its record. since: the rows from the rule's origin to x_t; names: of their
+    signals, by column. carry: of the decision before. before, tables: members of the record.
     """
     decision = episode.decide(
         shield,
@@ -239,7 +239,7 @@ def decide(
         asked.free,
         explanations if asked.explain else None,
     )
-    if decision.t != t:  # the rule's clock began after the session
+    if decision.t != t:  # the core counts from the rule's origin
         decision = decision._replace(t=t)
     return decision, record.make(decision, asked, since[-1], names, before, tables)
 
@@ -249,7 +249,7 @@ def pack(rows: Floats) -> bytes:
 
 
 def there(found: F | None, key: str) -> F:
-    """What the store has of a session. Raises NotFound where it has nothing."""
+    """`found`, what the store has of a session. Raises NotFound where that is None."""
     if found is None:
         raise missing(key)
     return found

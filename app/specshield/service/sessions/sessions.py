@@ -1,4 +1,4 @@
-"""Sessions: how they begin, are listed, closed, read back and erased. steps.py decides their steps."""
+"""Begins, lists, closes, reads back and erases sessions. steps.py decides their steps."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ from specshield.shield.signals import any_signal
 from specshield.world.learned import LearnedMap
 
 R = TypeVar("R")
-Begun = tuple[dict[str, Any], State, Floats]  # its config, its state without when it expires, its first row
+Begun = tuple[dict[str, Any], State, Floats]  # the config, the state but for `expires_at`, the first row
 
 
 class Sessions:
-    """What takes longer than a moment runs in threads; the store, and a deletion that is under way, are
-    awaited. A session is known by its key, which says whose it is (access/owners.py).
+    """All that takes long runs in threads or other processes, so that the event loop goes on. In these
+    methods the `id` of a session is its key in the store, which says whose it is (access/owners.py).
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Sessions:
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
         limits = await self._check_room(key)
-        if self._settings.redis_url is None:  # the store writes to this disk
+        if self._settings.redis_url is None:  # the embedded store writes to this disk
             files.check_free(self._settings.data_dir, self._settings.disk_reserve_bytes)
         settings = self._checked(request)
         preference = None
@@ -92,7 +92,7 @@ class Sessions:
                 )
             else:
                 begun = await self._run(begin, self._shields, request, settings, preference, key.name)
-        except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
+        except Exception:  # where a policy was deleted meanwhile, that is the error to tell of
             await self._policies.still_there(ids, key.name)
             raise
         config, state, rows = begun
@@ -100,7 +100,7 @@ class Sessions:
         stored_as = scoped(key.name, config["id"])
         change = Change(state.packed(), pack(rows))
         await self._store.create(stored_as, files.to_json(config), change, *limits)
-        try:  # whoever deletes a policy sees this session now, or has marked the policy before
+        try:  # a deletion of a policy sees this session from now on; an earlier one has left a mark
             await self._policies.still_there(config["policy_ids"], key.name)
         except SpecshieldError:
             await self._store.delete(stored_as)
@@ -108,7 +108,7 @@ class Sessions:
         return describe([config], state)
 
     def _checked(self, request: SessionRequest) -> Config:
-        """The session's settings. Raises InputError for those that cannot be had."""
+        """The session's settings. Raises InputError for settings that are not allowed."""
         if (request.max_steps or 0) > self._settings.max_steps:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
@@ -129,11 +129,11 @@ class Sessions:
         shown = list[dict[str, Any]]()
         for config, state in found:
             item = describe(rules.read(config), State.of(state))
-            # Regions can be many, and whoever wants them reads the session.
+            # A rule may have many regions: callers who want them read the session.
             item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
             del item["robot"]
             shown.append(item)
-            await asyncio.sleep(0)  # others come between: a config of many regions takes a millisecond
+            await asyncio.sleep(0)  # lets other requests run: a config of many regions takes a millisecond
         return shown, following
 
     async def delete(self, id: str) -> None:
@@ -142,8 +142,8 @@ class Sessions:
             raise missing(id)
 
     async def close(self, id: str, request: CloseRequest) -> dict[str, Any]:
-        """The session, with `robustness_bounds` beside its fields; none where its map has been deleted since.
-        Closing again changes nothing.
+        """The session's description with `robustness_bounds`, which are null where the map was deleted since.
+        Closing a closed session changes nothing.
         """
         for _ in range(RACES):
             session = Session.of(there(await self._store.load(id), id))
@@ -180,7 +180,7 @@ class Sessions:
             return session, session.state.spec_status, (-math.inf, math.inf)
 
     async def trajectory(self, id: str) -> tuple[Iterator[bytes], bytes]:
-        """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
+        """One JSON object for each step (`Session.lines`), and the rules as one JSON list."""
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
         return session.lines(found.steps), files.to_json(describe(session.rules, session.state)["rules"])
@@ -196,8 +196,8 @@ class Sessions:
         return await self._run(session.learned)
 
     async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes, LearnedMap]:
-        """The session's config, its last step, its rows since it came to its map, the record of the last one,
-        empty where that has none, or was decided by another rule than the one in force, and what was learned.
+        """What a picture needs: the session's config, its last step, the rows since it came to its map, the
+        record of the last step, b"" if the rule in force did not decide that, and what it learned of the map.
         """
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
@@ -208,7 +208,7 @@ class Sessions:
         return dict(session.config), t, rows, found.steps[t] if decided else b"", session.state.learned
 
     async def using(self, owner: str, policy_id: str) -> str | None:
-        """An owner's session that may still ask this policy, if there is one, archived ones too."""
+        """The id of a session of this owner, in the store or the archive, that still needs this policy."""
         after = None
         while True:
             found, after = await self._store.everything(f"{owner}@", after, 1000)
@@ -220,7 +220,7 @@ class Sessions:
                 return None
 
     async def _check_room(self, key: Key) -> list[Limit]:
-        """A caller's limits. Raises LimitReached where one is reached."""
+        """The limits on the number of sessions that apply to a caller. Raises LimitReached."""
         if self._store.full:
             told = f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions"
             expected = "room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES"
@@ -241,7 +241,7 @@ class Sessions:
 def begin(
     shields: Shields, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
 ) -> Begun:
-    """As `Begun` has it."""
+    """Checks that a session can begin, and makes what is stored of it. preference: for `request.shaping`."""
     records = [shields.policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)

@@ -1,4 +1,4 @@
-"""The shields and preferences that this process has prepared: taken from memory, or made."""
+"""The shields and preferences of sessions: this process keeps those that it has prepared."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from specshield.shield.preference import Preference
 
 Bounds = tuple[float, float]
 Run = Callable[..., Awaitable[Any]]  # calls a function in a thread
-QUICK = ("reachability", "dqn")  # methods whose decisions take a millisecond; of others nothing is known
+QUICK = ("reachability", "dqn")  # methods whose decisions take about a millisecond; others may take long
 
 
 class Shields:
-    """Threads may share it. Preparing a preference takes seconds, in a thread of its own, so that no decision
-    waits for it.
+    """Threads may share it. Preferences take seconds to prepare; a thread of its own does that, so that no
+    decision waits for it.
     """
 
     def __init__(self, policies: Policies, room: int) -> None:
         self.policies, self._shields = policies, files.Recent[Shield](room)
-        self._judges = files.Recent[Shield](room)  # without policies, by the digests of what was asked
+        self._judges = files.Recent[Shield](room)  # shields without policies, for verdicts, by digest
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self.tables = Tables()
@@ -45,7 +45,7 @@ class Shields:
         self._latest: Future[Preference] | None = None  # the last one that was asked for
 
     def slow(self, session: Session) -> bool:
-        """Whether its decisions take long. A session with a preference stays where that is prepared."""
+        """Whether decisions take long and another process can make them, which has no prepared preference."""
         return session.config["shaping"] == PROJECTION and self.slow_policies(session.config["policy_ids"])
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
@@ -55,7 +55,7 @@ class Shields:
         )
 
     def note_slow(self, session: Session) -> None:
-        """One of its decisions has taken long."""
+        """From now on the decisions of sessions with these policies count as slow."""
         self._slow.put(tuple(session.config["policy_ids"]), True)
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
@@ -65,7 +65,7 @@ class Shields:
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
 
     def of(self, session: Session) -> Shield:
-        """The session's shield, with its preference if that is at hand."""
+        """The session's shield, with its preference if that is prepared."""
         shield = self.get(session.config["policy_ids"], session.settings)
         if session.config["shaping"] == PROJECTION:
             return shield
@@ -74,8 +74,8 @@ class Shields:
     async def prepared(
         self, run: Run, shaping: str, keys: Sequence[str], pose: Sequence[float], owner: str
     ) -> Preference:
-        """The preference that a session with these policies asks for, once it can be used. Raises
-        FragmentError where it cannot be prepared for the formula.
+        """Returns the preference `shaping` for these policies once it is prepared. run: calls a function in a
+        thread. Raises FragmentError for a formula that the preference cannot be prepared for.
         """
 
         def begin() -> Future[Preference]:
@@ -86,9 +86,9 @@ class Shields:
         return preference
 
     def verdict(self, config: Mapping[str, Any], rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
-        """Of a rule on a session's rows [t + 1, 3 + signals], and the bounds on its robustness.
+        """The verdict on a rule by a session's rows [t + 1, 3 + signals], and the bounds on its robustness.
 
-        Needs no policy, since those of a rule that is over may have been deleted.
+        No policy is needed: the policies of an earlier rule may have been deleted.
         """
         since = rows[rules.origin(config) :]
         if not len(since):
@@ -98,13 +98,13 @@ class Shields:
         return episode.close(judge, since[:, :3], rules.signals_in(since, names))
 
     def _judge(self, map_id: str, robot: str | dict[str, Any], spec: dict[str, Any]) -> Shield:
-        """A task made anew for each verdict would stay for as long as what is prepared of it (`view_of`)."""
+        """A shield for verdicts. It is kept, since what `view_of` prepares keeps each task in memory."""
         task = self.policies.task(Description(map_id, robot, spec, "", 0, {}))
         body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
         return Shield(task, (), Config(), body, view)
 
     def settled(self, session: Session) -> Session:
-        """The session with the verdicts of the rules that its last switch ended, on x_t and its signals."""
+        """The session with the verdicts of the rules that its last switch ended, once x_t is known."""
         begins, state = rules.begins(session.config), session.state
         if state.finished or state.next_t > begins or len(session.rows) <= begins:
             return session
@@ -126,8 +126,8 @@ class Shields:
     def _preference_at_hand(self, shield: Shield, session: Session) -> Preference | None:
         """The session's preference if this process has prepared it; until then the session projects.
 
-        What is missing is begun, unless another is being prepared: with more tasks than are kept they would
-        pile up, and whoever creates a session would wait for them all.
+        A missing one is begun unless another is being prepared: with more tasks than are kept, requests would
+        pile up, and a caller who creates a session would wait for all of them.
         """
         name, ids = session.config["shaping"], session.config["policy_ids"]
         found = self._preferences.peek((name, *ids))

@@ -1,4 +1,4 @@
-"""What changes in a session, as it is stored: MessagePack, since every step writes it."""
+"""The part of a session that every step changes, stored as MessagePack."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from specshield.world.learned import LearnedMap
 
 
 class State(msgspec.Struct, frozen=True, array_like=True):
-    """Of a session after its last change.
+    """A session's state after its last change.
 
-    length: of the stored poses. next_t: the step after the last decided one. expires_at [s since 1970]. head:
-    SHA-256 of the last step's record, of the config where none was decided under it. carry: `own` makes one
-    of it to decide with; stored field by field, its poses as float64 bytes. verdicts: of the rules that held
-    before the one in force. any_signal: of where the rule in force began to hold, as `Decision` has it.
+    length: the number of stored poses. next_t: the step after the last decided one. expires_at [s since
+    1970]. head: SHA-256 of the last step's record, or of the config if that has no decided step yet. carry:
+    the memory of the last decision, to be copied by `own` before it is used. verdicts: of the rules before
+    the one in force. any_signal: as in `Decision`, at the first step of the rule in force.
     """
 
     length: int
@@ -46,12 +46,12 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def has_learned(self) -> bool:
-        """Whether the session's map has ever changed, without unpacking it."""
+        """Whether the session's own map has ever changed."""
         return self.carry is not None and len(self.carry.learned or b"") > HEAD.size
 
     @property
     def learned(self) -> LearnedMap:
-        """As the last decision left it. Raises StoreError where another version stored it in another form."""
+        """The learned map after the last decision. Raises StoreError where another version stored it."""
         try:
             return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
         except (struct.error, zlib.error, ValueError) as error:
@@ -60,7 +60,7 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
 
 def own(carry: Carry | None) -> Carry | None:
-    """The same with poses that nothing else holds, and that are writable: kernels were compiled for that."""
+    """A copy whose poses are an array of its own and writable, as the kernels were compiled for."""
     return None if carry is None else carry._replace(next_poses=carry.next_poses.copy())
 
 

@@ -1,4 +1,4 @@
-"""Deciding steps: the session is read, the step decided and both written, all of it or nothing."""
+"""Decides steps: reads the session, makes the decision, and writes poses, record and state, or nothing."""
 
 from __future__ import annotations
 
@@ -29,14 +29,12 @@ from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
 from specshield.task import check_signals
 
-ROOM = 64 << 20  # bytes of sessions kept in memory, some 4,000 of them. Chosen by hand.
-WATCHED = 32  # decisions in threads after a long one. Chosen by hand.
-SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
-LONG = 0.03  # [s] of a processor for one decision
+ROOM = 64 << 20  # [bytes] of sessions kept in memory: some 4,000. Chosen by hand.
+WATCHED = 32  # decisions that are made in threads after a long one. Chosen by hand.
+SHORT = 0.005  # [s] that one decision may hold the event loop
+LONG = 0.03  # [s] of a processor; decisions that take longer are made in another process
 SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
-
-
-# id, the versions before and after, the state, x_t with its signals, the step's record and what is answered
+# The session's key, its version before and after, its state, x_t with the signals, the record and the answer.
 Tell = Callable[[str, bytes, bytes, State, Floats, StepRecord, StepAnswer], None]
 
 
@@ -49,21 +47,20 @@ class Decided(NamedTuple):
 
 
 class Pace:
-    """How long decisions with some policies take.
+    """How long decisions with some policies take, which says where the next one is made.
 
-    They are made on the event loop, since handing one to a thread and back costs about as much as most of
-    them take. The first few are made in threads, the others on the event loop, by the clock alone. Where two
-    close together took longer than SHORT, that may be the decisions or a busy machine: so for the next few,
-    on the event loop too, the processor's time is measured.
-    After one that computed longer than SHORT the next WATCHED are made in threads; after several of LONG, all
-    of them in another process.
+    Most decisions are made on the event loop: handing one to a thread and back takes about as long as the
+    decision. The first few are made in threads. On the event loop only the elapsed time is measured. Where
+    two decisions close together took longer than SHORT, the decisions may be long or the machine busy: so the
+    processor's time is measured for the next few. After one that computed for longer than SHORT, the next
+    WATCHED are made in threads; after several longer than LONG, all are made in another process.
     """
 
     def __init__(self) -> None:
-        self._threaded = SEVERAL  # how many are still to be made in threads
-        self.doubted = 0  # how many are still to be measured on the event loop
+        self._threaded = SEVERAL  # decisions that are still to be made in threads
+        self.doubted = 0  # decisions on the event loop whose processor time is still to be measured
         self._since_late = WATCHED  # decisions on the event loop since one that took longer than SHORT
-        self._long = 0
+        self._long = 0  # decisions that computed for longer than LONG
 
     @property
     def short(self) -> bool:
@@ -74,7 +71,7 @@ class Pace:
         return self._long >= SEVERAL
 
     def add(self, seconds: float, computed: float | None) -> None:
-        """computed: the seconds of a processor, None where they were not measured."""
+        """Notes a decision. computed: its seconds of a processor, None if they were not measured."""
         if computed is None:
             late = seconds > SHORT
             self.doubted = SEVERAL if late and self._since_late < SEVERAL else 0
@@ -86,10 +83,8 @@ class Pace:
 
 
 class Steps:
-    """Short decisions are made on the event loop, others in threads (the rollouts release the interpreter),
-    and long ones in other processes.
-
-    ttl: how long a session is kept after its last change [s]. tell: called for each step that is stored.
+    """Decides steps on the event loop, in threads (rollouts release the interpreter) or in other processes:
+    see `Pace`. ttl: how long a session is kept after its last change [s]. tell: called for each stored step.
     """
 
     def __init__(
@@ -97,8 +92,8 @@ class Steps:
     ) -> None:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
         self._heavy, self._tell = heavy, tell
-        self.deciding = 0  # steps that somebody waits for
-        # One may be old, since other processes write too: the script that appends compares versions.
+        self.deciding = 0  # steps that are being decided
+        # A kept session may be out of date, since other processes write too: the append then finds that out.
         self.recent = files.Recent[Session](ROOM, attrgetter("size"))
         self._paces = files.Recent[Pace](1000)
 
@@ -106,7 +101,9 @@ class Steps:
         """The answer. `timing` collects the seconds of rollout and store."""
         self.deciding += 1
         try:
-            if self.deciding > 1:  # what came together is read, then decided, then stored: fewer cache misses
+            if (
+                self.deciding > 1
+            ):  # requests that came together are all read before one is decided: fewer misses
                 await asyncio.sleep(0)
             return await self._answer(id, request, timing)
         finally:
@@ -115,8 +112,8 @@ class Steps:
     async def _answer(self, id: str, request: StepBody, timing: defaultdict[str, float]) -> StepAnswer:
         session, step = self.recent.peek(id), None
         if session is not None and request.t < session.state.next_t:
-            session = None  # a replay, or an error: both are the store's to tell
-        current = False  # whether the session is what the store has just shown
+            session = None  # a replay or an error: for both the store has to be asked
+        current = False  # whether the session was read from the store just now
         for _ in range(RACES):
             if session is None:
                 asked = time.perf_counter()
@@ -145,7 +142,7 @@ class Steps:
                 answer = record.told(decided.decision, request.witnesses, request.explain)
                 row = decided.session.rows[-1]
                 self._tell(id, session.version, written, state, row, decided.record, answer)
-                if state.finished:  # nobody goes on with it
+                if state.finished:  # no further step will need it
                     self.recent.drop(id)
                 else:
                     held = len(change.state)
@@ -180,7 +177,7 @@ class Steps:
             made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
-        # A step may take long where the map is no longer as the policies were made for.
+        # A step may take long once the map is no longer the one that the policies were made for.
         learns = bool(request.occupied or request.free or session.state.has_learned)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
         cpu: float | None = None
@@ -189,12 +186,12 @@ class Steps:
             made, seconds, cpu = await loop.run_in_executor(self._threads, timed, *asked)
         elif pace.doubted:
             made, seconds, cpu = timed(self._shields, session, request)
-        else:  # asking for the thread's own time would cost a tenth of the step
+        else:  # measuring the thread's own time would cost a tenth of the step
             begun = time.perf_counter()
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
         timing["rollout"] += seconds
-        if not learns:  # what a map that changed costs says nothing of other sessions of the policy
+        if not learns:  # the time on a changed map says nothing about other sessions with these policies
             pace.add(seconds, cpu)
             if pace.long:
                 self._shields.note_slow(session)
@@ -202,7 +199,7 @@ class Steps:
 
 
 def timed(shields: Shields, session: Session, request: StepBody) -> tuple[Decided, float, float]:
-    """As `decided`, with the seconds that it took, and those of them that this thread computed."""
+    """As `decided`, and the seconds that it took: elapsed, and of this thread's computing."""
     begun, computed = time.perf_counter(), time.thread_time()
     made = decided(shields, session, request)
     return made, time.perf_counter() - begun, time.thread_time() - computed

@@ -1,4 +1,4 @@
-"""Another rule, map or robot for a session from step t on: checked first, then written as a step is."""
+"""Switches a session to another rule, map or robot from step t on. A switch is written as a step is."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from specshield.shield.signals import any_signal
 
 
 class Switches:
-    """Nothing is changed by a switch that is refused."""
+    """A switch that is refused changes nothing."""
 
     def __init__(self, store: Store, shields: Shields, run: Run, heavy: Heavy, settings: Settings) -> None:
         self._store, self._policies, self._shields = store, shields.policies, shields
@@ -38,8 +38,8 @@ class Switches:
         self._ttl, self._most = settings.session_ttl, settings.max_steps
 
     async def make(self, id: str, request: SwitchRequest, owner: str) -> dict[str, Any]:
-        """The session after it. Raises NotFound, InfeasibleSwitch, PoseError, HistoryGap, HistoryConflict,
-        StepConflict, SessionFinished, LimitReached.
+        """Makes a switch and returns the session's description. Raises NotFound, InfeasibleSwitch, PoseError,
+        HistoryGap, HistoryConflict, StepConflict, SessionFinished, LimitReached.
         """
         for _ in range(RACES):
             found = there(await self._store.load(id, request.t - 1 if request.t else None), id)
@@ -57,7 +57,7 @@ class Switches:
             version = await self._store.append(id, session.version, change)
             if not isinstance(version, bytes):
                 continue
-            try:  # whoever deletes a policy sees this session now, or has marked the policy before
+            try:  # a deletion of a policy sees this session from now on; an earlier one has left a mark
                 await self._policies.still_there(ids, owner)
             except SpecshieldError:
                 await self._store.append(id, version, Change(found.state, found.rows, config=found.config))
@@ -66,7 +66,7 @@ class Switches:
         raise contended(id)
 
     async def _made(self, wanted: Wanted, owner: str) -> Session:
-        """In a thread, or in another process where the policies' decisions take long."""
+        """The session under its new rule, made in a thread, or in another process for slow policies."""
         session, ids = wanted.session, wanted.policy_ids
         shaping = session.config["shaping"]
         if shaping == PROJECTION and await self._run(self._shields.slow_policies, ids):
@@ -81,8 +81,8 @@ class Switches:
 
 
 class Wanted(NamedTuple):
-    """A switch at step t of `session`, which has the poses that came with it. row [3 + signals]: that of x_t;
-    where the session does not have it yet, as the last decision foresaw it.
+    """A switch at step t of `session`, which has the poses that came with the request. row [3 + signals]: of
+    x_t, as the last decision foresaw it where the session does not have it yet.
     """
 
     session: Session
@@ -93,7 +93,7 @@ class Wanted(NamedTuple):
 
 
 def _is_last(session: Session, request: SwitchRequest, policy_ids: Sequence[str]) -> bool:
-    """Whether this very switch was made last, so that it was sent again. Raises HistoryConflict where it was
+    """Whether the session's last switch is this one, which was sent again. Raises HistoryConflict if it was
     made from another x_t.
     """
     if len(session.rules) == 1:
@@ -110,7 +110,7 @@ def _is_last(session: Session, request: SwitchRequest, policy_ids: Sequence[str]
 def _wanted(
     session: Session, request: SwitchRequest, policy_ids: Sequence[str], step: bytes | None
 ) -> Wanted:
-    """step: what the decision before x_t left. Raises what is wrong with asking for it."""
+    """Checks the request. step: the record of step t - 1, None if that has none."""
     t = request.t
     session.check_ahead(t, f"step {t} is decided, or was passed over: no other rule can hold there")
     if len(session.rules) >= rules.MOST_RULES:
@@ -129,8 +129,8 @@ def _wanted(
 
 
 def _foreseen(session: Session, step: bytes) -> Sequence[float]:
-    """Where the action leads that the last decision gives to run, as the SDK's `execute` has it. An earlier
-    switch at the same step may have brought another robot since that decision.
+    """The pose to which the last decision's action leads, which the SDK calls `execute`. The robot is the one
+    of that decision: an earlier switch at the same step may have brought another one.
     """
     config = session.rules[rules.at(session.rules, len(session.rows) - 1)]
     answer = record.answer(record.decode(step), session.rows[-1], config["actions"])
