@@ -229,7 +229,7 @@ def test_a_listing_holds_store_and_archive_in_order_and_each_session_once(url, a
     async def story(store):
         ids = ["a", "abc", "abcdefgh", "abcdefghi", "abcdefghij", "b", "robot-1", "robot-10", "robot-2", "z"]
         sample = random.Random(1).sample(ids, len(ids))
-        for owner in ("", "ann@", "ann.b@"):
+        for owner in ("@", "ann@", "ann.b@"):
             for i, id in enumerate(sample):
                 version = await begin(store, owner + id, 1)
                 if i % 3:
@@ -237,16 +237,16 @@ def test_a_listing_holds_store_and_archive_in_order_and_each_session_once(url, a
                 if i % 3 == 2:  # is back, and its file is still there
                     assert await store.append(owner + id, version, change(1))
         for limit in (1, 3, 100):
-            for owner in ("ann@", "ann.b@"):
+            for owner in ("", "ann", "ann.b"):
                 listed, after = [], None
                 while True:
                     page, after = await store.everything(owner, after, limit)
                     listed += [config.removeprefix(b"config of ").decode() for config, _ in page]
                     if after is None:
                         break
-                assert listed == [owner + id for id in ids]
+                assert listed == [f"{owner}@{id}" for id in ids]
         assert {e.key for e, _ in archive.sizes()} == {
-            owner + id for owner in ("", "ann@", "ann.b@") for i, id in enumerate(sample) if i % 3
+            owner + id for owner in ("@", "ann@", "ann.b@") for i, id in enumerate(sample) if i % 3
         }
 
     run(url, archive, story)
@@ -262,7 +262,7 @@ def test_a_session_that_moves_while_they_are_listed_is_listed(url, archive, befo
             await move(store, "ann@robot")
             assert isinstance(await store.append("ann@robot", version, change(1)), bytes)
         slow = ArchivingStore(url, 10.0, TTL, Held(archive))
-        listing = asyncio.create_task(slow.everything("ann@", None, 10))
+        listing = asyncio.create_task(slow.everything("ann", None, 10))
         await asyncio.to_thread(slow.archive.reached.wait)
         await move(store, "ann@robot")
         slow.archive.go.set()
@@ -321,12 +321,12 @@ def test_a_store_whose_memory_is_full_is_freed_by_moves_and_deletions(url, archi
 
 def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
     async def story(store):
-        await begin(store, "old", 1)
-        dump = await store.dump("old")
-        assert await store.put_away("old", time.time() - 2, dump)
-        assert await store.load("old") is None
+        await begin(store, "@old", 1)
+        dump = await store.dump("@old")
+        assert await store.put_away("@old", time.time() - 2, dump)
+        assert await store.load("@old") is None
         assert await store.everything("", None, 10) == ([], None)
-        await begin(store, "old", 0)  # its id is free again
+        await begin(store, "@old", 0)  # its id is free again
 
     run(url, archive, story)
 
@@ -367,7 +367,7 @@ def test_a_file_that_is_not_whole_or_not_ours_is_left_out_of_lists_and_named_onc
             caplog.clear()
             left_out.cache_clear()
             for _ in range(2):
-                page, _ = await store.everything("ann@", None, 10)
+                page, _ = await store.everything("ann", None, 10)
                 assert [config for config, _ in page] == [b"config of ann@whole"]
             assert [file.name in line for line in caplog.messages] == [True]
             with pytest.raises(StoreError, match=file.name):

@@ -125,7 +125,7 @@ class Sessions:
     async def page(
         self, owner: str, after: str | None, limit: int
     ) -> tuple[list[dict[str, Any]], str | None]:
-        found, following = await self._store.everything(f"{owner}@", after, limit)
+        found, following = await self._store.everything(owner, after, limit)
         shown = list[dict[str, Any]]()
         for config, state in found:
             item = describe(rules.read(config), State.of(state))
@@ -211,7 +211,7 @@ class Sessions:
         """The id of a session of this owner, in the store or the archive, that still needs this policy."""
         after = None
         while True:
-            found, after = await self._store.everything(f"{owner}@", after, 1000)
+            found, after = await self._store.everything(owner, after, 1000)
             for config, state in found:
                 had, now = rules.read(config), State.of(state)
                 if not now.finished and policy_id in needed(had, now):

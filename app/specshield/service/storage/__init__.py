@@ -1,1 +1,1 @@
-"""Where sessions are kept: a Redis-protocol server, our own or another's."""
+"""Where sessions are kept: a store of the Redis protocol, the server's own or another one, and an archive."""

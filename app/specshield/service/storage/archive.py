@@ -1,11 +1,11 @@
-"""What sessions leave in files once the store has let go of them: one file for each state of one session.
+"""The archive: files of sessions that have left the store, one file for each state of a session.
 
     <owner>@/<first 8 characters of the id>/<id>/<changes>,<beginning>,<expires>
 
-A session's key is `owner@id`, as in the store; the folder of keys without an owner is `_`. `changes` counts
-the writes that the session has seen and `beginning` tells two sessions of one id apart, so a file never
-changes, and a writer that comes late harms none that is newer. A file is a head (config, state) and a body
-(rows, steps), each packed with msgpack and compressed with zstandard. Blocking.
+A session's key is `owner@id`, as in the store. `changes` is the number of writes to the session, and
+`beginning` differs for two sessions of one id. So a file never changes, and a late writer never replaces a
+newer file. A file has a head (config, state) and a body (rows, steps), each packed with msgpack and
+compressed with zstandard. All calls block.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ import msgspec
 import zstandard
 
 from specshield.errors import StoreError
+from specshield.service.access.owners import scoped
 from specshield.service.storage.objects import Objects, left_out
 from specshield.service.storage.store import Dump
 
 MAGIC = b"specshield session 1\n"
-PLAIN = "_"
-FOLDER = 8  # characters of an id that name its folder: in ids that the server makes up, those of one minute
+FOLDER = 8  # characters of an id that name its folder; ids that the server makes in one minute share them
 LEVEL = 3  # of zstandard; see docs/scale.md for what it costs
 NAME = re.compile(r"([0-9a-f]{8,16}),([0-9a-f]+),([0-9a-f]{9,16})")
-FIRST = 8192  # bytes that are read to see a head, which is one read for most
+FIRST = 8192  # bytes that are read first: most heads lie within them
 HEAD = msgspec.msgpack.Decoder(tuple[bytes, bytes, bytes])
 BODY = msgspec.msgpack.Decoder(tuple[bytes, list[bytes]])
-DAMAGED = (ValueError, zstandard.ZstdError)  # what reading raises of a file that is not whole, or not ours
+DAMAGED = (ValueError, zstandard.ZstdError)  # raised for a file that is damaged, or not of the archive
 
 
 @dataclass(frozen=True, order=True)
@@ -44,7 +44,7 @@ class Entry:
 
     @staticmethod
     def of(key: str, name: str) -> Entry | None:
-        """None where the name is not one that `path` makes."""
+        """None for a name that is not of the form that `path` gives."""
         match = NAME.fullmatch(name)
         if match is None:
             return None
@@ -61,8 +61,8 @@ class Archive:
         self._objects = objects
 
     def put(self, key: str, expires: float, dump: Dump) -> tuple[Entry, int]:
-        """Keeps a session; when this returns it outlives a power cut. The file, and the bytes that were
-        written: 0 where it was there before.
+        """Writes a session's file, which survives a power cut once this returns. Returns its entry, and the
+        number of bytes that were written: 0 if the file existed already.
         """
         beginning, _, changes = dump.version.decode().partition(":")
         entry, content = Entry(key, int(changes), beginning, int(expires) + 1), pack(dump)
@@ -72,17 +72,17 @@ class Archive:
         return entry, len(content)
 
     def entries(self, key: str) -> list[Entry]:
-        """Every file of a session, the latest last, also those that have expired."""
+        """All files of a session, the latest last; also those that have expired."""
         found = [Entry.of(key, name) for name in self._objects.names(_folder(key))]
         return sorted(entry for entry in found if entry is not None)
 
     def find(self, key: str) -> Entry | None:
-        """The latest state that is kept of a session."""
+        """The latest file of a session that has not expired."""
         kept = [entry for entry in self.entries(key) if entry.expires > time.time()]
         return kept[-1] if kept else None
 
     def read(self, entry: Entry) -> Dump | None:
-        """None where it was removed meanwhile. Raises StoreError for a file that is not one of ours."""
+        """The session in a file; None if it was removed meanwhile. Raises StoreError for a damaged file."""
         content = self._objects.read(entry.path)
         try:
             return None if content is None else unpack(content)
@@ -90,8 +90,8 @@ class Archive:
             raise StoreError(_damaged(entry, error)) from error
 
     def head(self, entry: Entry) -> tuple[bytes, bytes] | None:
-        """(config, state) without reading the rest; None where it was removed meanwhile, and for a file that
-        is not one of ours: only the log tells of that, since the owner's other sessions can be listed.
+        """(config, state), without reading the rest of the file. None if it was removed meanwhile or is
+        damaged: a line of the log says so, and the owner's other sessions can still be listed.
         """
         content = self._objects.read(entry.path, 0, FIRST)
         try:
@@ -106,43 +106,39 @@ class Archive:
         self._objects.remove(entry.path)
 
     def erase(self, key: str) -> bool:
-        """Removes every file of a session; False where there was none."""
+        """Removes all files of a session. False if there was none."""
         found = self.entries(key)
         for entry in found:
             self.remove(entry)
         return bool(found)
 
     def after(self, owner: str, id: str | None) -> Iterator[Entry]:
-        """The latest state of each session of an owner, in order of id, from after this id on.
-
-        owner: what comes before the id in a key, as in `alice@`.
-        """
-        now = time.time()
-        for part in self._objects.names(owner or PLAIN):
+        """The latest file of each session of an owner that has not expired, in order of id, after this id."""
+        folder = scoped(owner, "")
+        for part in self._objects.names(folder):
             if id is not None and part < id[:FOLDER]:
                 continue
-            for found in self._objects.names(f"{owner or PLAIN}/{part}"):
-                if id is None or found > id:
-                    yield from [e for e in self.entries(owner + found) if e.expires > now][-1:]
+            for found in self._objects.names(f"{folder}/{part}"):
+                if (id is None or found > id) and (entry := self.find(folder + found)) is not None:
+                    yield entry
 
     def sizes(self) -> Iterator[tuple[Entry, int]]:
-        """Every file there is, and its bytes."""
+        """All files, each with its bytes."""
         for path, size in self._objects.sizes(""):
-            owner, *parts = path.split("/")
-            key = ("" if owner == PLAIN else owner) + parts[1] if len(parts) == 3 else ""
-            entry = Entry.of(key, parts[2]) if key else None
+            folder, *parts = path.split("/")
+            entry = Entry.of(folder + parts[1], parts[2]) if len(parts) == 3 else None
             if entry is not None and entry.path == path:
                 yield entry, size
 
 
 def pack(dump: Dump) -> bytes:
-    """The content of a file: the same for the same session and version."""
+    """The content of a file, which is the same for the same session and version."""
     head = _compressed([dump.config, dump.state, dump.version])
     return MAGIC + len(head).to_bytes(4, "little") + head + _compressed([dump.rows, dump.steps])
 
 
 def unpack(content: bytes) -> Dump:
-    """Raises one of DAMAGED where the content is not what `pack` made."""
+    """The session that `pack` was given. Raises one of DAMAGED for other content."""
     rows, steps = BODY.decode(_decompressed(content[_bounds(content)[1] :]))
     return Dump(*_head(content), rows, steps)
 
@@ -156,7 +152,7 @@ def _bounds(content: bytes) -> tuple[int, int]:
     """Where the head begins and ends."""
     start = len(MAGIC) + 4
     if content[: len(MAGIC)] != MAGIC or len(content) < start:
-        raise ValueError("it is not one that this version of specshield wrote")
+        raise ValueError("it is not a file that this version of specshield wrote")
     return start, start + int.from_bytes(content[len(MAGIC) : start], "little")
 
 
@@ -174,5 +170,5 @@ def _damaged(entry: Entry, error: Exception) -> str:
 
 
 def _folder(key: str) -> str:
-    owner, at, id = key.rpartition("@")
-    return f"{owner + at or PLAIN}/{id[:FOLDER]}/{id}"
+    owner, _, id = key.rpartition("@")
+    return f"{scoped(owner, '')}/{id[:FOLDER]}/{id}"

@@ -1,12 +1,13 @@
-"""The store and the archive as one: what the store has let go of is read from files, and goes on from there.
+"""The store and the archive as one: a session that has left the store is read from its file, and a change
+brings it back into the store.
 
-Two copies of a session never go on side by side, whoever is killed when:
+Two copies of a session never both go on, whatever process is killed and when:
 
-- A session leaves the store when its file is on the disk, and only if its version is still the file's.
-- It comes back under a script that refuses where there is one already. For `FENCE` seconds the store also
-  remembers with which version a session left, or that it was erased, and refuses any other: a server that
-  read an older file, and was slow, comes too late.
-- Where both have it, the store's is the one that counts.
+- A session leaves the store once its file is on the disk, and only if its version is still the file's.
+- A script brings it back, and refuses where the store has one already. For `FENCE` seconds the store also
+  remembers with which version a session left, or that it was erased, and refuses any other version: so a slow
+  server that read an older file comes too late.
+- Where both the store and the archive have a session, the store's counts.
 """
 
 from __future__ import annotations
@@ -17,22 +18,23 @@ from typing import ParamSpec, TypeVar
 
 import anyio
 
+from specshield.service.access.owners import scoped
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, exists, keys
 
 P = ParamSpec("P")
 R = TypeVar("R")
-TURN = "specshield:archive:"  # and of what: the name of the server whose turn it is
+TURN = "specshield:archive:"  # followed by the work: the name of the server whose turn it is
 SIZE = "specshield:archive:bytes"
 FENCE = 600  # [s]; longer than any server takes from reading a file to bringing it back. Chosen by hand.
 TRIES = 5  # of reading a file that a newer one replaces, and of bringing a session back
 AT_ONCE = 8  # reads and writes of files of one server process; more would wait for the same disk
 
-# A store whose memory is full takes all writes of a script if the first one needs no memory. So it is in
-# those that have to be done to free some.
+# A store whose memory is full runs a script to its end if the first write needs no memory. The scripts that
+# have to run then, since they free memory, begin with such a write.
 
-# KEYS of the next three: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 where the session has
-# left the store with this version, now or before; 0 where it goes on; -1 where it was erased.
+# KEYS of the next three: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 if the session has
+# left the store with this version, now or before; 0 if the store has a newer one; -1 if it was erased.
 LEAVE = """\
 local version, fence = redis.call('HGET', KEYS[1], 'version'), redis.call('GET', KEYS[4])
 if version and version ~= ARGV[1] then return 0 end
@@ -41,7 +43,7 @@ redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])
 redis.call('SET', KEYS[4], ARGV[1], 'EX', ARGV[2])
 return 1"""
 
-# ARGV: version, FENCE, time to live [ms], config, state, rows, steps...  Returns 1 where it is back.
+# ARGV: version, FENCE, time to live [ms], config, state, rows, steps...  Returns 1 if the session is back.
 RETURN = """\
 local fence = redis.call('GET', KEYS[4])
 if redis.call('EXISTS', KEYS[1]) == 1 or (fence and fence ~= ARGV[1]) then return 0 end
@@ -52,13 +54,13 @@ for i = 7, #ARGV do redis.call('RPUSH', KEYS[3], ARGV[i]) end
 for i = 1, 3 do redis.call('PEXPIRE', KEYS[i], ARGV[3]) end
 return 1"""
 
-# ARGV: '', FENCE.  Returns 1 where there was one.
+# ARGV: '', FENCE.  Returns 1 if there was a session.
 ERASE = """\
 local found = redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])
 redis.call('SET', KEYS[4], 'erased', 'EX', ARGV[2])
 return found > 0 and 1 or 0"""
 
-# ARGV: name, time to live [s].  Returns 1 where nobody but this name holds the key: it then does.
+# ARGV: name, time to live [s].  Returns 1 unless the key holds another name: it then holds this one.
 TAKE = """\
 if (redis.call('GET', KEYS[1]) or ARGV[1]) ~= ARGV[1] then return 0 end
 redis.call('PERSIST', KEYS[1])
@@ -68,7 +70,7 @@ COUNT = "redis.call('PERSIST', KEYS[1]) return redis.call('INCRBY', KEYS[1], ARG
 
 
 class ArchivingStore(Store):
-    """A `Store` whose sessions may lie in the archive. Its `count` is of those in the store."""
+    """A `Store` whose sessions may also lie in the archive. `count` counts only those in the store."""
 
     def __init__(self, url: str, timeout: float, ttl: int, archive: Archive, replicas: int = 0) -> None:
         super().__init__(url, timeout, ttl, replicas)
@@ -94,7 +96,7 @@ class ArchivingStore(Store):
         return Record(dump.config, dump.state, dump.version, dump.rows, step or None)
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
-        """Brings the session back first where it lies in the archive, again if it is put away meanwhile."""
+        """As `Store.append`. A session in the archive is brought back, and again if it moves meanwhile."""
         for _ in range(TRIES):
             found = await super().append(id, version, change)
             if found is not None or not await self._bring_back(id):
@@ -106,7 +108,7 @@ class ArchivingStore(Store):
         return found if found is not None else await self.in_thread(self._archived, id)
 
     async def delete(self, id: str) -> bool:
-        """Erases all of it. False where there was nothing."""
+        """Erases a session in store and archive. False if there was none."""
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.take_off([id.encode()])
@@ -115,12 +117,12 @@ class ArchivingStore(Store):
     async def everything(
         self, owner: str, after: str | None, limit: int
     ) -> tuple[list[tuple[bytes, bytes]], str | None]:
-        """A page of (config, state), from store and archive, and the id to go on after. owner: what comes
-        before the id in a key, as in `alice@`.
+        """(config, state) of an owner's next sessions after an id, in store and archive, at most `limit`; and
+        the id after which the next page begins, None on the last page.
         """
+        prefix = scoped(owner, "")
         async with self._reaching():
-            low = f"({owner}{after or ''}" if owner or after else "-"
-            high = f"({owner[:-1]}A" if owner else "+"  # A follows @
+            low, high = f"({prefix}{after or ''}", f"({owner}A"  # A follows @
             running = {id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)}
         entries = self.archive.after(owner, after)  # after the store: a session may leave it meanwhile
         archived = await self.in_thread(lambda: {each.key: each for each in islice(entries, limit)})
@@ -131,11 +133,11 @@ class ArchivingStore(Store):
             live = await self._of_each(ids, "hmget", "config", "state")
         found: list[tuple[bytes, bytes]] = []
         for id, (config, state) in zip(ids, live, strict=True):
-            after = id.removeprefix(owner)
+            after = id.removeprefix(prefix)
             if config is not None:
                 found.append((config, state))
                 continue
-            kept = None if id in running else archived.get(id)  # what has just left has a newer file
+            kept = None if id in running else archived.get(id)  # one that has just left has a newer file
             entry = kept or await self.in_thread(self.archive.find, id)
             head = None if entry is None else await self.in_thread(self.archive.head, entry)
             if head is not None:
@@ -148,8 +150,8 @@ class ArchivingStore(Store):
     async def idle(
         self, after: str | None, limit: int, least: float
     ) -> tuple[list[tuple[str, float, bytes]], str | None]:
-        """Of `limit` sessions in the store, in order of id, those that have not changed for `least` seconds:
-        (id, seconds, state), and the id to go on after.
+        """Looks at the next `limit` sessions in the store after an id. Returns (id, seconds, state) of those
+        that have not changed for `least` seconds, and the id after which to go on, None at the end.
         """
         async with self._reaching():
             low = "-" if after is None else f"({after}"
@@ -165,17 +167,17 @@ class ArchivingStore(Store):
         return found, ids[-1] if len(ids) == limit else None
 
     async def my_turn(self, what: str, name: str, seconds: int) -> bool:
-        """Whether nobody but `name` had a turn at this in so many seconds; it is then the turn of `name`."""
+        """Whether it is now the turn of `name` at this work: no other name had one in the last `seconds`."""
         async with self._reaching():
             return bool(await self._take(keys=[TURN + what], args=[name, seconds]))
 
     async def count_bytes(self, more: int = 0) -> int:
-        """The bytes of the archive: as they were last counted, and what has moved there since."""
+        """Adds `more` to the bytes of the archive and returns them: the last count plus what moved since."""
         async with self._reaching():
             return int(await self._count(keys=[SIZE], args=[more]))
 
     async def put_away(self, id: str, expires: float, dump: Dump) -> bool:
-        """Moves a session to the archive. False where it goes on, or was erased meanwhile."""
+        """Moves a session to the archive. False if the store has a newer version, or it was erased."""
         entry, size = await self.in_thread(self.archive.put, id, expires, dump)
         async with self._reaching():
             left = await self._leave(keys=_keys(id), args=[dump.version, FENCE])
@@ -191,7 +193,7 @@ class ArchivingStore(Store):
         return bool(left > 0)
 
     async def _bring_back(self, id: str) -> bool:
-        """Whether the session was brought back, by us or by another."""
+        """Brings a session back from the archive. False if the archive does not have it."""
         dump = await self.in_thread(self._archived, id)
         if dump is None:
             return False

@@ -35,29 +35,29 @@ if TYPE_CHECKING:
 FORMS = (
     "redis://127.0.0.1:6379/0, rediss://..., unix:///path, redis+sentinel://h1,h2/service, redis+cluster://h1"
 )
-# What a client raises where the store cannot be reached, or not make sense of; redis-py keeps the trouble
-# of a cluster whose nodes are all away apart from its other errors.
+# What a client raises if the store cannot be reached or does not understand. RedisClusterException, for a
+# cluster of which no node answers, is no RedisError.
 FAILURES = (redis.RedisError, redis.exceptions.RedisClusterException, OSError)
-CONNECTIONS = 64  # of one server process to a single server; those who want more wait
-TRIES = 3  # after the first; all within the caller's time limit. Chosen by hand.
-JOBS = "{specshield}:rq"  # what rq's keys begin with in a cluster, so that one server of it has them all
+CONNECTIONS = 64  # of one server process to a single store; further calls wait for one
+TRIES = 3  # after the first one, all within the caller's time limit. Chosen by hand.
+JOBS = "{specshield}:rq"  # how rq's keys begin in a cluster, so that one node of it has them all
 PORTS = {"sentinel": 26379, "cluster": 6379}
 
 
 @contextmanager
 def reaching() -> Iterator[None]:
-    """A store that cannot be reached meanwhile is a StoreError."""
+    """Within the block, an error of the connection to the store becomes a StoreError."""
     try:
         yield
     except (*FAILURES, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
-            raise  # that one is uvloop's word for a connection that the other side has closed
+            raise  # uvloop's error for a connection that the other side has closed says that
         raise away(error) from error
 
 
 @contextmanager
 def naming(settings: Settings) -> Iterator[None]:
-    """A command's StoreError names the setting that says where the store is, where that is set."""
+    """Within the block, a StoreError names the setting REDIS_URL, if it is set. For commands."""
     try:
         yield
     except StoreError as error:
@@ -67,15 +67,15 @@ def naming(settings: Settings) -> Iterator[None]:
 
 
 def away(error: Exception) -> StoreError:
-    if isinstance(error, redis.ResponseError):  # it says why: its memory is full, it is a replica, ...
+    if isinstance(error, redis.ResponseError):  # its text says why: the memory is full, it is a replica, ...
         return StoreError(f"the store refuses: {error!s:.200}")
     return StoreError(f"the store cannot be reached: {type(error).__name__}")
 
 
 class _Cluster(redis.asyncio.cluster.RedisCluster):
     """A cluster's client. When a node is gone, redis-py closes every connection to discover the nodes again,
-    also connections on which other tasks are about to write. Such a write fails with an AttributeError; here
-    it is a ConnectionError, as that of any store that cannot be reached.
+    also those on which other tasks are about to write. Such a write fails with an AttributeError, which here
+    becomes a ConnectionError as for any store that cannot be reached.
     """
 
     async def execute_command(self, *args: Any, **kwargs: Any) -> Any:
@@ -86,13 +86,13 @@ class _Cluster(redis.asyncio.cluster.RedisCluster):
 
 
 def connect(url: str, blocking: bool = False, **options: Any) -> Any:
-    """A client for this URL, an asyncio one unless blocking. Only a blocking one of a cluster opens at once.
+    """A client for this URL, for asyncio unless `blocking`. A cluster's blocking client connects at once.
 
-    options: redis-py's, for every connection. Raises ValueError for a URL of no form above.
+    options: redis-py's, for every connection. Raises ValueError for a URL that has none of the forms above.
     """
     kit: Any = redis if blocking else redis.asyncio
     kind = urlsplit(url).scheme.partition("+")[2]
-    # A lost connection is tried again. A store that does not answer would hold a blocking caller once a try.
+    # A blocking caller tries again only after a lost connection: a silent store would hold it each time.
     only: Any = {"supported_errors": (redis.ConnectionError,)} if blocking else {}
     retry = kit.retry.Retry(ExponentialBackoff(cap=0.2, base=0.02), TRIES, **only)
     options = {"retry": retry, "socket_connect_timeout": options.get("socket_timeout"), **options}
@@ -115,7 +115,7 @@ def connect(url: str, blocking: bool = False, **options: Any) -> Any:
 
 
 def connect_to_jobs(url: str, **options: Any) -> Any:
-    """A blocking client for rq's worker, which knows no clusters: of the one server that has its keys."""
+    """A blocking client for rq's worker, which knows no clusters: for the node that has its keys."""
     if not is_cluster(url):
         return connect(url, blocking=True, **options)
     cluster = connect(url, blocking=True, socket_timeout=options.get("socket_connect_timeout"))
@@ -125,10 +125,10 @@ def connect_to_jobs(url: str, **options: Any) -> Any:
 
 
 def drops(store: Any) -> str | None:
-    """What is to be told of a store that drops keys once its memory is full; None where it keeps them all, or
-    does not say. store: a blocking client.
+    """A warning about a store that drops keys once its memory is full; None if it keeps them all, or does not
+    say. store: a blocking client.
     """
-    with suppress(*FAILURES):  # a managed one may refuse it
+    with suppress(*FAILURES):  # a managed store may refuse the command
         told = store.info("memory")
         policy = told.get("maxmemory_policy", "noeviction")
         if told.get("maxmemory") and policy != "noeviction":
@@ -141,7 +141,7 @@ def is_cluster(url: str) -> bool:
 
 
 def _parse(url: str) -> tuple[list[tuple[str, int]], list[str], Mapping[str, Any]]:
-    """The hosts, the names in the path, and what user, password, TLS and options say."""
+    """The hosts, the names in the path, and redis-py's arguments for user, password, TLS and options."""
     parts = urlsplit(url)
     scheme, _, kind = parts.scheme.partition("+")
     if scheme not in ("redis", "rediss") or kind not in PORTS:
@@ -153,7 +153,7 @@ def _parse(url: str) -> tuple[list[tuple[str, int]], list[str], Mapping[str, Any
         if not one.hostname:
             raise ValueError("a host without a name")
         hosts.append((one.hostname, one.port or PORTS[kind]))
-    parse: Any = redis.connection.parse_url  # gives numbers and booleans where redis-py takes no text
+    parse: Any = redis.connection.parse_url  # makes numbers and booleans of the texts in the URL
     found: dict[str, Any] = parse(f"redis://{user}@?{parts.query}")
     found |= {"ssl": True} if scheme == "rediss" else {}
     return hosts, [unquote(name) for name in parts.path.split("/") if name], found

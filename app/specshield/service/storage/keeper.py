@@ -1,8 +1,8 @@
-"""Keeps the embedded store running while anybody uses it, and not a moment longer.
+"""Keeps the embedded store running as long as any process uses it.
 
 Run as `python keeper.py <folder> <server binary> <arguments...>` with the read end of the users' pipe as
-standard input. Every user holds a write end; the pipe reaches its end when the last of them is gone, however
-it went, and the store is then told to stop. Only the standard library is imported: this starts in 15 ms.
+standard input. Every user holds a write end. Once the last user has ended, even if it was killed, the pipe
+reaches its end, and the store is told to stop. This imports the standard library alone, to start in 15 ms.
 """
 
 import ctypes
@@ -16,22 +16,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 LOCK = "keeper.lock"
-GRACE = 10.0  # seconds for the store to write its file out and leave
+GRACE = 10.0  # [s] for the store to write its file and end
 
 
 def private(path: str, flags: int) -> int:
-    """For `open`: a file that is made is this user's alone."""
+    """An opener for `open`: a new file can be read and written by this user alone."""
     return os.open(path, flags, 0o600)
 
 
 def follow_parent() -> None:
-    """Linux: this process is told to stop when the one that started it is gone, however it went."""
+    """On Linux, this process gets SIGTERM once the process that started it has ended, even by a kill."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def at_end_of_input(action: Callable[[], object]) -> None:
-    """Calls it, in a thread, when standard input ends: a pipe from whoever started this process."""
+    """Calls `action` in a thread once standard input ends: a pipe from the process that started this one."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -42,17 +42,17 @@ def at_end_of_input(action: Callable[[], object]) -> None:
 
 
 def _as_store() -> None:
-    """It can be told to stop from its first moment on; the keeper, whose signals it takes over, cannot."""
+    """Lets SIGTERM end the store, which would else ignore it as the keeper does."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     follow_parent()
 
 
 def main(folder: Path, command: list[str]) -> int:
-    """Hold the lock, run the store, stop it at the end of standard input; its exit status."""
+    """Holds the lock, runs the store, and stops it at the end of standard input. Exits with its status."""
     lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-    fcntl.flock(lock, fcntl.LOCK_EX)  # waits until the store before this one has let go of the file
+    fcntl.flock(lock, fcntl.LOCK_EX)  # waits until the previous store has ended
     with open(folder / "store.log", "ab", buffering=0) as log:
-        # The lock's descriptor goes to the store too: it is free only when both are gone.
+        # The store inherits the lock's descriptor, so that the lock is free only once both have ended.
         store = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -73,5 +73,5 @@ def main(folder: Path, command: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the pipe says when; the store gets its own signals
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the end of the pipe ends the keeper
     main(Path(sys.argv[1]), sys.argv[2:])

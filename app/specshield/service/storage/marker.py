@@ -1,7 +1,7 @@
-"""Servers and workers of one store have to share their files too, or one cannot find what another made.
+"""Servers and workers of one store have to share their files too, or one does not find what another made.
 
-So the files hold a name in `store-id`, and the store holds the same. Who finds them to differ does not start.
-Blocking.
+So the file `store-id` and the store hold the same name. A server or worker that finds other names does not
+start. All calls block.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from specshield.service.storage.objects import open_objects
 
 FILE = "store-id"
 KEY = "specshield:store-id"
-WAIT = 5.0  # [s] for another server, which starts for the first time at this moment, to write the file
+WAIT = 5.0  # [s] for another server, whose first start is under way, to write the file
 
 
 def check_files(url: str, place: str, timeout: float) -> None:
-    """place: the folder or URL of maps and policies. timeout: of the store [s].
+    """Compares the names in the files and in the store, and writes them at the first start. place: the folder
+    or URL of maps and policies. timeout: of the store [s].
 
-    Raises InputError where other servers of this store have other files, and StoreError where either cannot
-    be reached.
+    Raises InputError if the servers of this store use other files, and StoreError if the files or the store
+    cannot be reached.
     """
     files = open_objects(place)
     mine = files.read(FILE)
@@ -44,7 +45,7 @@ def check_files(url: str, place: str, timeout: float) -> None:
 
 
 def check_first(store: Any, place: str) -> None:
-    """The same before a server starts: nothing is written, and nothing waited for. store: a blocking one."""
+    """Compares the names without writing or waiting, before a server starts. store: a blocking client."""
     files, theirs = open_objects(place), store.get(KEY)
     if theirs is not None and files.read(FILE) != theirs:
         raise _elsewhere(place)

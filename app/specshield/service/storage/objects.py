@@ -1,4 +1,4 @@
-"""Files that several machines share, in a folder or behind an fsspec URL: whole or not there. Blocking."""
+"""Files that several machines share, in a folder or at an fsspec URL. Readers see whole files only."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from specshield.errors import InputError, InsufficientStorage, SpecshieldError, 
 
 P = ParamSpec("P")
 R = TypeVar("R")
-DRAFT = ".draft-"  # what a file is called until it is whole; names that begin with a dot are not listed
-LEFT = 3600  # [s] after which a draft is one that nobody will finish
-TRIES = 10  # of making a folder that another process removes because it is empty
+DRAFT = ".draft-"  # how the name of an incomplete file begins; names that begin with a dot are not listed
+LEFT = 3600  # [s] after which nobody will complete a draft
+TRIES = 10  # to make a folder that another process removes because it is empty
 ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 log = logging.getLogger("specshield")
 
 
 def open_objects(place: str) -> Objects:
-    """The files of a folder, or of an fsspec URL. Raises InputError where nothing here reads such a URL."""
+    """The files in a folder or at an fsspec URL. Raises InputError if no installed package reads the URL."""
     try:
         if "://" not in place:
             return Folder(Path(place))
@@ -34,7 +34,7 @@ def open_objects(place: str) -> Objects:
 
         files, root = url_to_fs(place, use_listings_cache=False, skip_instance_cache=True)
         return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
-    except (ImportError, ValueError, OSError) as error:  # OSError: it is tried to reach the server
+    except (ImportError, ValueError, OSError) as error:  # OSError: the server of the URL cannot be reached
         raise InputError(
             f"files at {place!r} cannot be used: {error}",
             expected="a folder, or a URL such as s3://bucket/prefix with the package that reads it (s3fs)",
@@ -42,7 +42,7 @@ def open_objects(place: str) -> Objects:
 
 
 def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """absent: makes what is answered where there is no such file or folder; without it, that is an error."""
+    """Turns a method's OSError into a SpecshieldError. absent: makes the result if the file is not there."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)
@@ -60,7 +60,7 @@ def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, 
 
 
 def unusable(error: OSError) -> SpecshieldError:
-    """What a caller is told of it; which file it is, the log alone. A full disk is InsufficientStorage."""
+    """The error for callers, InsufficientStorage for a full disk. Only the log names the file."""
     if error.errno in (ENOSPC, EDQUOT):
         return InsufficientStorage("the server's disk is full", expected="a disk with room")
     log.warning("%s", error)
@@ -69,7 +69,7 @@ def unusable(error: OSError) -> SpecshieldError:
 
 class Folder:
     """A folder of this machine, or one that several machines mount. Paths are relative, with `/`. Every
-    method raises StoreError where the files cannot be reached, and InsufficientStorage for a full disk.
+    method raises StoreError if the files cannot be reached, and InsufficientStorage for a full disk.
     """
 
     def __init__(self, root: Path) -> None:
@@ -78,20 +78,20 @@ class Folder:
 
     @_reaching(absent=lambda: None)
     def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
-        """The bytes from `start` to before `end`; None where there is no such file."""
+        """The bytes from `start` to before `end`; None if there is no such file."""
         with open(self.root / path, "rb") as file:
             file.seek(start)
             return file.read(-1 if end is None else end - start)
 
     @_reaching()
     def write(self, path: str, content: bytes) -> None:
-        """Puts the file there, in place of another. When this returns the file outlives a power cut."""
+        """Writes the file, or replaces it. Once this returns, the file survives a power cut."""
         target = self.root / path
         draft = target.with_name(f"{DRAFT}{secrets.token_hex(8)}")
         for left in reversed(range(TRIES)):
             made = [folder for folder in target.parents if not folder.exists()]
             try:
-                self.root.stat()  # a network folder that is away is not made anew
+                self.root.stat()  # fails if a network folder is away: mkdir would make a local one
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_through(draft, content)
                 os.replace(draft, target)
@@ -106,10 +106,10 @@ class Folder:
 
     @_reaching()
     def remove(self, path: str) -> None:
-        """Removes the file, if it is there."""
+        """Removes the file if it is there, and the folders that are empty then."""
         target = self.root / path
         target.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # not empty, or gone already
+        with contextlib.suppress(OSError):  # the folder is not empty, or gone already
             for folder in target.parents:
                 if folder == self.root:
                     break
@@ -117,16 +117,16 @@ class Folder:
 
     @_reaching(absent=list)
     def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder, in order; empty where there is no such folder."""
+        """The sorted names of what lies directly in a folder; none if there is no such folder."""
         return sorted(name for name in os.listdir(self.root / folder) if not name.startswith("."))
 
     def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
-        """Every file below a folder in order of path: (path, bytes)."""
+        """(path, bytes) of every file below a folder, in order of path."""
         here = self.root / folder
         try:
             about = here.stat()
             if here.name.startswith(DRAFT) and about.st_mtime < time.time() - LEFT:
-                here.unlink()  # by a process that was killed
+                here.unlink()  # it is from a process that was killed
             elif here.is_symlink() and any(map(here.samefile, here.parents)):
                 left_out(f"{here} is left out: it is a link to a folder that it lies in")
             elif S_ISDIR(about.st_mode):
@@ -135,7 +135,7 @@ class Folder:
             elif not here.name.startswith("."):
                 yield folder, about.st_size
         except FileNotFoundError:
-            return  # it may go at any time
+            return  # another process may remove it at any time
         except OSError as error:
             if not folder:
                 raise unusable(error) from error
@@ -143,7 +143,7 @@ class Folder:
 
 
 class Remote:
-    """What an fsspec file system keeps, with the methods of `Folder`. Most write a file whole or not."""
+    """Files of an fsspec file system, with the methods of `Folder`. Most such systems write whole files."""
 
     def __init__(self, files: Any, root: str) -> None:
         self._files, self._root = files, root.rstrip("/")
@@ -179,7 +179,7 @@ class Remote:
 
 @lru_cache(1000)
 def left_out(told: str) -> None:
-    """A line of the log, but not at each look, for what is passed over among the files."""
+    """Logs a warning about a file that is left out, once for the same text."""
     log.warning("%s", told)
 
 
@@ -187,7 +187,7 @@ Objects = Folder | Remote
 
 
 def write_through(path: Path, content: bytes) -> None:
-    """When this returns, the content is on the disk; its name is there after `sync` of the folder."""
+    """Writes a file. Its content is on the disk once this returns, its name after `sync` of the folder."""
     with open(path, "wb") as file:
         file.write(content)
         file.flush()

@@ -1,9 +1,9 @@
-"""Sessions in a store of the Redis protocol. Bytes in, bytes out; what they mean is for sessions.py.
+"""Sessions in a store of the Redis protocol. The store handles bytes; service/sessions knows what they mean.
 
-A session is three keys of one slot, expiring together: `specshield:v2:{id}:session`, a hash of config, state
-and version; `:rows`, its poses and signals; `:steps`, the list of what each step left, by t. A session's
-id here says whose it is (access/owners.py). Ids are also in `specshield:sessions`, a sorted set for listing,
-in which those of one owner stand together; it may name sessions that have expired.
+A session has three keys in one slot that expire together: `specshield:v2:{id}:session`, a hash of config,
+state and version; `:rows`, its poses and signals; `:steps`, the list of the steps' records. The `id` of a
+session is its key `owner@id` (access/owners.py). The ids are also in `specshield:sessions`, a sorted set in
+which the sessions of one owner stand together; it may still name sessions that have expired.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
 
-PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
-AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
+PAGE_BYTES = 256 << 10  # of configs, on a page of a list; chosen by hand: read and shown in a few ms
+AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in about 2 ms
 INDEX = "specshield:sessions"
-Limit = tuple[str | None, int]  # how many sessions an owner may have, or with None all of them
-NO_VERSION = b"-"  # that no session ever has
+Limit = tuple[str | None, int]  # the most sessions that an owner may have, or for None all owners together
+NO_VERSION = b"-"  # a version that no session has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
 
 
 class Record(NamedTuple):
-    """A session as one read saw it. rows: its history. step: what a step left, None if not decided."""
+    """A session as one read saw it. rows: its history. step: the record of the step asked for, if any."""
 
     config: bytes
     state: bytes
@@ -40,7 +40,7 @@ class Record(NamedTuple):
 
 
 class Dump(NamedTuple):
-    """All of a session. steps: what each step left, by t; b"" for one that was passed over."""
+    """All of a session. steps: the record of each step, b"" for a step without a decision."""
 
     config: bytes
     state: bytes
@@ -50,7 +50,7 @@ class Dump(NamedTuple):
 
 
 class News(NamedTuple):
-    """What a session has from some step on: rows and steps as in `Dump`, both from that step."""
+    """A session's state, and its rows and steps, as in `Dump`, from some step on."""
 
     state: bytes
     rows: bytes
@@ -58,8 +58,8 @@ class News(NamedTuple):
 
 
 class Change(NamedTuple):
-    """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it. config: the
-    one that takes the place of the stored one.
+    """One write: `rows` go to byte `offset`, `step` is the record of step `t`, `state` the new state. config:
+    the new one, b"" to keep the stored one.
     """
 
     state: bytes
@@ -71,9 +71,9 @@ class Change(NamedTuple):
 
 
 class Store:
-    """Every method raises StoreError where the store cannot be reached in time.
+    """Every method raises StoreError if the store cannot be reached in time.
 
-    replicas: how many of the store's have to have a change, or what is read of a session, before it is told.
+    replicas: how many replicas of the store need to have a change, or what was read, before a call returns.
     """
 
     def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
@@ -91,24 +91,24 @@ class Store:
 
     @asynccontextmanager
     async def _reaching(self) -> AsyncIterator[None]:
-        """One time limit for all of it, with waits for a connection and tries; what fails is a StoreError."""
+        """Sets one time limit for the block, waits and tries included. A failure becomes a StoreError."""
         with reaching(), anyio.fail_after(self._timeout):
             yield
 
     async def ping(self) -> None:
-        """Whether it takes a write: one whose disk is full still answers reads."""
+        """Checks that the store takes a write: a store whose disk is full still answers reads."""
         async with self._reaching():
             await self.redis.set("specshield:ready", 1, ex=60)
         if self._replicas:
             await self.load("ready")
 
     async def create(self, id: str, config: bytes, change: Change, *limits: Limit) -> bytes:
-        """The first version. Raises SessionExists, and LimitReached where a limit is reached. `config` has
-        to be unlike any other, so that a retry knows its own.
+        """Creates a session and returns its first version. Raises SessionExists and LimitReached. `config`
+        has to be unique, so that a second try recognizes the session that a first one created.
         """
         await self.list_name(id, *limits)
         begun = await self._write(id, b"", change, config)
-        if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
+        if isinstance(begun, Record) and begun.config == config:  # by an earlier try whose answer was lost
             begun = begun.version
         if not isinstance(begun, bytes):
             raise exists(id)
@@ -116,9 +116,9 @@ class Store:
         return begun
 
     async def list_name(self, id: str, *limits: Limit) -> None:
-        """Lists a session before it is there: else a server that is killed in between leaves one that nobody
-        ever finds or moves. It is listed again afterwards, since names without a session are taken off the
-        list. Raises LimitReached for a new one where a limit is reached.
+        """Adds a session's name to the list before the session is created: else a server that is killed in
+        between leaves a session that no list has. The name is added again afterwards, since names without a
+        session are taken off the list. Raises LimitReached for a new name.
         """
         bounds = [part for limit in limits for part in (*_range(limit[0]), limit[1])]
         async with self._reaching():
@@ -127,27 +127,28 @@ class Store:
             raise no_more(limits[passed - 1][1])
 
     async def take_off(self, ids: Sequence[bytes]) -> None:
-        """Takes names off the list that have no session. One that was made meanwhile is listed again."""
+        """Takes names without a session off the list. A session that is created meanwhile is listed again."""
         await self.redis.zrem(INDEX, *ids)
         gone = await self._gone(ids)
         if back := {id: 0 for id in ids if id not in gone}:
             await self.redis.zadd(INDEX, back)
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
-        """All of the change, and the new version; or nothing where `version` is no longer the latest: then
-        the session as it is, with what step `change.t` left, or None where it is gone. One round trip.
+        """Writes the change and returns the new version, in one round trip. If `version` is not the latest
+        any more, writes nothing and returns the session with the record of step `change.t`, None if it is
+        gone.
         """
         return await self._write(id, version, change, change.config)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
-        """The session, with what step t left; None where there is none. One round trip."""
+        """The session with the record of step t; None if there is no session. One round trip."""
         found = await self._write(id, NO_VERSION, Change(b"", t=t), b"")
         assert not isinstance(found, bytes)
         return found
 
     async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
-        """What is lost on the way is sent again. Twice, an append changes nothing: the second finds the
-        version gone on.
+        """A command that is lost on the way is sent again. An append that arrives twice is made once: the
+        second one finds another version.
         """
         field = "" if change.t is None else change.t
         args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
@@ -160,7 +161,7 @@ class Store:
         return None if config is None or rows is None else Record(config, state, version, rows, step or None)
 
     async def dump(self, id: str) -> Dump | None:
-        """All of a session as it is at one moment; None where there is none."""
+        """All of a session, as it is at one moment; None if there is no session."""
         session, rows, steps = keys(id)
         async with self._reaching(), self.redis.pipeline(transaction=True) as pipe:
             pipe.hmget(session, "config", "state", "version")
@@ -170,13 +171,13 @@ class Store:
         return None if config is None or found is None else Dump(config, state, version, found, left)
 
     async def count(self, owner: str | None) -> int:
-        """How many sessions an owner has, or with None all of them; some may have expired."""
+        """How many sessions an owner has, or for None all owners; some may have expired."""
         low, high = _range(owner)
         async with self._reaching():
             return int(await self.redis.zlexcount(INDEX, low, high))
 
     async def sweep(self, owner: str | None) -> None:
-        """Drops the names of sessions that have expired."""
+        """Takes the names of expired sessions off the list, for an owner or for None all owners."""
         low, high = _range(owner)
         while True:
             async with self._reaching():
@@ -188,24 +189,24 @@ class Store:
                 low = f"({ids[-1].decode()}"
 
     async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
-        """Of each session the version, None where the store has none. One round trip."""
+        """The version of each session, None for one that the store does not have. One round trip."""
         async with self._reaching():
             return await self._of_each(ids, "hget", "version")
 
     async def news(self, asked: Sequence[tuple[str, int, int, int]]) -> list[News | None]:
-        """For each (id, t, bytes of a row, count): what it has from step t on, at most so many steps."""
+        """For each (id, t, bytes of a row, count) what the session has from step t on, for `count` steps."""
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             for id, t, width, count in asked:
                 session, rows, steps = keys(id)
                 pipe.lrange(steps, t, t + count - 1)
-                pipe.getrange(rows, t * width, (t + count) * width - 1)  # later: it has all rows of the steps
-                pipe.hget(session, "state")  # last: a switch that makes the rows wider is seen here
+                pipe.getrange(rows, t * width, (t + count) * width - 1)  # after the steps: has all their rows
+                pipe.hget(session, "state")  # last, so that it shows a switch that made the rows wider
             found = await pipe.execute()
         three = zip(found[::3], found[1::3], found[2::3], strict=True)
         return [None if state is None else News(state, rows, steps) for steps, rows, state in three]
 
     async def held_bytes(self) -> int:
-        """The memory that the store takes: in a cluster all its masters, their replicas not counted."""
+        """The bytes of memory that the store takes; in a cluster all masters together, without replicas."""
         async with self._reaching():
             if not self._in_cluster:
                 return int((await self.redis.info("memory"))["used_memory"])
@@ -213,7 +214,7 @@ class Store:
             return sum(int(node["used_memory"]) for node in nodes.values())
 
     async def _of_each(self, ids: Sequence[str], command: str, *fields: str) -> list[Any]:
-        """What this command tells of each session's hash. One round trip, none without ids."""
+        """The result of this command on each session's hash. One round trip, none without ids."""
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
                 getattr(pipe, command)(keys(id)[0], *fields)
@@ -221,7 +222,7 @@ class Store:
         return told
 
     async def _that_fit(self, ids: list[str], room: int) -> tuple[list[str], int]:
-        """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""
+        """The first ids whose configs take about `room` bytes, at least one, and the bytes that are left."""
         for taken, size in enumerate(await self._of_each(ids, "hstrlen", "config"), start=1):
             room -= size
             if room <= 0:
@@ -229,13 +230,13 @@ class Store:
         return ids, room
 
     async def _gone(self, ids: Sequence[bytes]) -> list[bytes]:
-        """Those that have no session."""
+        """The ids that have no session."""
         there = await self._of_each([id.decode() for id in ids], "exists")
         return [id for id, found in zip(ids, there, strict=True) if not found]
 
 
 def _range(owner: str | None) -> tuple[str, str]:
-    """Where INDEX has an owner's sessions, or with None all: from owner@ to before ownerA. A follows @."""
+    """The bounds of an owner's names in INDEX: owner@ to before ownerA (A follows @); for None, of all."""
     return ("-", "+") if owner is None else (f"[{owner}@", f"({owner}A")
 
 

@@ -1,8 +1,8 @@
 """One connection to a single server of the Redis protocol, which all steps of a process share.
 
-redis-py opens it, so that URLs, passwords, TLS and sentinels are its own. What is sent then goes past it:
-many callers' commands are on their way at once, and answers come back in order. A call through redis-py costs
-350 us of CPU, through this 105 (2,000 appends one after another, a unix socket, a busy machine).
+redis-py opens the connection, so that it handles URLs, passwords, TLS and sentinels. This module then uses it
+directly: the commands of many callers are under way together, and their answers come in order. A call takes
+105 us of CPU, and 350 by redis-py (2,000 appends one after another, a unix socket, a busy machine).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ import redis
 
 from specshield.errors import StoreError
 
-TRIES = 3  # after the first, over new connections; all within the caller's time limit. Chosen by hand.
-PART = 0.8  # of the time that is left for an answer, in which replicas may have it; the rest is to say so
-GONE = ("LOADING", "READONLY", "MASTERDOWN")  # replies of a server that is not, or no longer, the one to ask
+TRIES = 3  # after the first one, over new connections, all within the caller's time limit. Chosen by hand.
+PART = 0.8  # share of the remaining time in which replicas have to follow; the rest is for the answer
+GONE = ("LOADING", "READONLY", "MASTERDOWN")  # replies of a server that cannot be used, or not any more
 
 
 class Script:
@@ -32,8 +32,8 @@ class Script:
 
 
 class Wire:
-    """make: what makes redis-py's connection, not yet open. timeout: longest wait for one answer, with all
-    tries [s]. replicas: how many of the server's have to have all that an answer tells of before it is given.
+    """make: makes a connection of redis-py, not yet open. timeout: longest wait for one answer, all tries
+    included [s]. replicas: how many replicas need to have all that an answer tells before it is given.
     """
 
     def __init__(self, make: Callable[[], Any], timeout: float, replicas: int = 0) -> None:
@@ -42,18 +42,18 @@ class Wire:
         self._opening = asyncio.Lock()
 
     async def run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
-        """What the script returns. It may run twice where the answer to the first time was lost.
+        """What the script returns. The script may run twice if its first answer was lost.
 
-        Raises redis.RedisError, OSError or TimeoutError, and StoreError where replicas are missing.
+        Raises redis.RedisError, OSError or TimeoutError, and StoreError if too few replicas followed.
         """
         deadline = asyncio.get_running_loop().time() + self._timeout
         tries_left = TRIES
         while True:
             link = self._link
             if link is None or link.closed:
-                # anyio says again that the time is over: redis-py may miss it once, by asyncio.wait_for.
+                # anyio cancels repeatedly: asyncio.wait_for in redis-py may swallow the first cancellation.
                 with anyio.fail_after(deadline - asyncio.get_running_loop().time()):
-                    link = await self._open()  # redis-py tries several times by itself
+                    link = await self._open()  # redis-py itself tries several times
             try:
                 return await _run(link, script, keys, args, deadline)
             except redis.ConnectionError:
@@ -67,7 +67,7 @@ class Wire:
                 connection = self._make()
                 try:
                     await connection.connect()
-                except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
+                except RuntimeError as error:  # uvloop's error if the other side has closed it by now
                     raise redis.ConnectionError(str(error)) from error
                 self._link = _Link(connection, self._replicas)
             return self._link
@@ -91,14 +91,14 @@ async def _run(link: _Link, script: Script, keys: Sequence[str], args: Sequence[
 
 
 class _Link(asyncio.Protocol):
-    """An open connection, taken over from redis-py's; `closed` once it is of no more use.
+    """An open connection, taken over from redis-py; `closed` once it cannot be used any more.
 
-    Where replicas are asked for, each round of commands ends with a WAIT, and their answers are held until
-    the server says how many replicas have what it had done by then.
+    With `replicas`, each round of commands ends with a WAIT, and their answers are held until the server says
+    how many replicas have followed.
     """
 
     def __init__(self, connection: Any, replicas: int = 0) -> None:
-        self._connection = connection  # kept, or its transport would be closed
+        self._connection = connection  # is referenced here, since its deletion would close the transport
         self._replicas = replicas
         self._transport: asyncio.Transport = connection._writer.transport
         self._transport.set_protocol(self)
@@ -122,8 +122,8 @@ class _Link(asyncio.Protocol):
         return await answer
 
     def _flush(self) -> None:
-        """Sends all that callers asked for in one round of the event loop: the store then writes to its disk
-        once for all of it.
+        """Sends the commands of one round of the event loop together: the store then writes to its disk once
+        for all of them.
         """
         content = b"".join(self._unsent)
         self._unsent.clear()
@@ -135,7 +135,7 @@ class _Link(asyncio.Protocol):
             self._waiting.append((None, deadline))
         try:
             self._transport.write(content)
-        except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
+        except RuntimeError as error:  # uvloop's error if the other side has closed it by now
             self._transport.abort()
             self.connection_lost(error)
 
@@ -144,7 +144,7 @@ class _Link(asyncio.Protocol):
         while (found := self._reader.gets()) is not False:
             if isinstance(found, hiredis.PushNotification):
                 continue
-            if self.closed:  # its callers are told by connection_lost
+            if self.closed:  # `connection_lost` tells the callers
                 return
             answer, _ = self._waiting.popleft()
             if answer is None:
@@ -155,8 +155,8 @@ class _Link(asyncio.Protocol):
                 _give(answer, found)
 
     def _release(self, count: Any) -> None:
-        """Gives the answers that wait for the replicas. count: what WAIT returned."""
-        if not isinstance(count, int):  # it is, or has become, a replica itself
+        """Gives the answers that were held for the replicas. count: what WAIT returned."""
+        if not isinstance(count, int):  # the server is, or has become, a replica itself
             self.close()
             return
         for answer, found in self._held:
@@ -166,14 +166,14 @@ class _Link(asyncio.Protocol):
         self._held.clear()
 
     def _late(self) -> None:
-        """Looks after the oldest that waits. One that is late ends the connection: answers come in order."""
+        """Ends the connection if the oldest answer is late: the later ones come after it."""
         self._watch = None
         now = self._loop.time()
         while self._waiting and self._waiting[0][1] <= now:
             answer, _ = self._waiting.popleft()
             if answer is not None:
                 _give(answer, TimeoutError("the store did not answer in time"))
-            self.close()  # also where nobody waits any more: else the next would get this one's answer
+            self.close()  # even if nobody waits any more: else the next caller would get this answer
         if self._waiting:
             self._watch = self._loop.call_at(self._waiting[0][1], self._late)
 
@@ -198,7 +198,7 @@ def too_few(count: Any, replicas: int) -> StoreError:
 
 
 def _give(answer: asyncio.Future[Any], found: Any) -> None:
-    """Gives an answer to whoever waits for it, unless they have gone."""
+    """Gives an answer to its caller, unless the caller has been cancelled."""
     if answer.done():
         return
     if isinstance(found, hiredis.ReplyError):

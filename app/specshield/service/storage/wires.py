@@ -1,4 +1,4 @@
-"""A connection as in wire.py to each node of a cluster. redis-py knows which node has a key, and opens it."""
+"""One connection as in wire.py for each node of a cluster. redis-py knows which node has a key."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from redis.backoff import NoBackoff
 
 from specshield.service.storage.wire import PART, Script, Wire, too_few
 
-ELSEWHERE = ("MOVED", "ASK", "TRYAGAIN")  # replies of a node whose keys are at another, or on their way there
+ELSEWHERE = ("MOVED", "ASK", "TRYAGAIN")  # replies of a node whose keys have moved, or are about to move
 
 
 class Wires:
     """cluster: redis-py's client. timeout, replicas: as `Wire` has them."""
 
-    def __init__(self, cluster: Any, timeout: float, replicas: int = 0) -> None:
+    def __init__(self, cluster: Any, timeout: float, replicas: int) -> None:
         self._cluster, self._timeout, self._replicas = cluster, timeout, replicas
         self._wires: dict[str, Wire] = {}  # by the names of the nodes
         self._looking: asyncio.Future[Any] | None = None
 
     async def run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
-        """As `Wire.run`, on the node that has the keys. What this node does not have, or no longer, is asked
-        through redis-py, which is sent on to another node and remembers it.
+        """As `Wire.run`, on the node that has the keys. If that node has lost the keys, redis-py runs the
+        script: it follows the node's reply to another node, and remembers it.
         """
         try:
             with anyio.fail_after(self._timeout):
@@ -35,7 +35,7 @@ class Wires:
             raise
 
     def _look_again(self) -> None:
-        """Has it asked which node has which keys, by a task: a silent node takes all the time of a caller."""
+        """Starts a task that asks which node has which keys: a silent node would use up a caller's time."""
         if self._looking is None or self._looking.done():
             self._looking = asyncio.gather(self._cluster.nodes_manager.initialize(), return_exceptions=True)
 
@@ -47,7 +47,7 @@ class Wires:
         except redis.ConnectionError:
             pass
         except redis.ResponseError as error:
-            if str(error).startswith("CLUSTERDOWN"):  # it may be this node alone that is apart from the rest
+            if str(error).startswith("CLUSTERDOWN"):  # perhaps only this node is cut off from the others
                 self._look_again()
             if not str(error).startswith(ELSEWHERE):
                 raise
@@ -58,7 +58,7 @@ class Wires:
         if wire is None:
             for gone in self._wires.keys() - {each.name for each in self._cluster.get_nodes()}:
                 self._wires.pop(gone).close()
-            # As redis-py does: who asks a cluster tries again, not each connection.
+            # As in redis-py, the cluster's client tries again, and not each connection.
             options = {**node.connection_kwargs, "retry": redis.asyncio.retry.Retry(NoBackoff(), 0)}
             wire = Wire(lambda: node.connection_class(**options), self._timeout, self._replicas)
             self._wires[node.name] = wire
@@ -67,8 +67,8 @@ class Wires:
     async def _sent_on(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         written = await self._cluster.eval(script.text, len(keys), *keys, *args)
         if self._replicas:
-            # WAIT is for all that the node had done when the command before it, on the same connection, was
-            # done: by then it has this version, and still has it.
+            # WAIT covers all that the node has done before the last command on this connection: that command
+            # reads the version, which shows that the node has, and still has, what was written.
             node, longest = self._cluster.get_node_from_key(keys[0]), int(PART * 1000 * self._timeout)
             pipe = self._cluster.pipeline()
             pipe.execute_command("HGET", keys[0], "version", target_nodes=node)
