@@ -1,4 +1,4 @@
-"""The SDK: `ShieldClient` and `AsyncShieldClient`, their answers, and one class of error a problem.
+"""The SDK: `ShieldClient` and `AsyncShieldClient`, their answers, and one class of error for each problem.
 
     from specshield.client import ShieldClient
 
@@ -8,8 +8,8 @@
                 decision = session.step(robot.pose(), model.logits())
                 robot.execute(decision.execute)
 
-Errors are those of `specshield.errors`. Needs httpx and nothing else. Its names are imported when they are
-first used: `specshield.local` answers with the classes of `models`, and has no use for httpx.
+The errors are those of `specshield.errors`. The SDK needs httpx and nothing else. Its names are imported when
+they are first used, since `specshield.local` uses the classes of `models` without httpx.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""AsyncShieldClient: sync.py with `await`."""
+"""AsyncShieldClient: the same as sync.py, for asyncio."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class AsyncShieldClient:
         self._streams = AsyncStreams(self._http) if stream else None
         self.specs, self.maps = Specs(self), Maps(self)
         self.policies, self.sessions = Policies(self), Sessions(self)
-        self._session = AsyncSession  # what `sessions` gives
+        self._session = AsyncSession  # the class of what `sessions` returns
 
     async def __aenter__(self) -> AsyncShieldClient:
         return self
@@ -104,7 +104,7 @@ class AsyncShieldClient:
             if reply is not None and listens:
                 reply = replace(reply, feed=Feed(response.aiter_bytes(), opened.pop_all().aclose))
             elif reply is None and "network_stream" in response.extensions:
-                await response.extensions["network_stream"].aclose()  # nothing more is read from it
+                await response.extensions["network_stream"].aclose()  # what still comes is never read
             return reply
 
     async def _more(self, more: More) -> Reply:
@@ -135,7 +135,7 @@ class AsyncSession(SessionState, Generic[D]):
         await self._run(self._leave(error))
 
     async def events(self, after: int | None = None) -> AsyncIterator[Decision]:
-        """As `Session.events`."""
+        """The same as `Session.events`."""
         events = self._events(after)
         try:
             while (decision := await self._run(events.following())) is not None:

@@ -1,4 +1,4 @@
-"""What a robot can still know while the service cannot answer: where the certified continuation leads."""
+"""Follows the certified continuation while the service cannot answer."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from specshield.client.models import Decision, Pose
 from specshield.errors import InputError, LimitReached, SpecshieldError, TransportError
 
 OnFailure = Literal["raise", "witness", "stop"]
-NEAR = 0.05  # [m] beside the foreseen pose that is still there, beyond the session's margin; chosen by hand
-TURNED = 0.1  # [rad] the same for the heading; chosen by hand
-FIRST_PAUSE = 0.25  # s before an absent service is asked again, doubled each time; chosen by hand
-LONGEST_PAUSE = 4.0  # s; chosen by hand: a robot goes alone for no longer than this once the service is back
+NEAR = 0.05  # [m] that a robot may be off the foreseen pose, beyond the session's margin; chosen by hand
+TURNED = 0.1  # [rad] that its heading may be off; chosen by hand
+FIRST_PAUSE = 0.25  # [s] before an absent service is asked again, doubled each time; chosen by hand
+LONGEST_PAUSE = 4.0  # [s]; chosen by hand: so long a robot may go alone though the service is back
 
 
 def on_failure_value(value: str) -> OnFailure:
-    """InputError for another word."""
+    """`value`, if it is one of the three words. Raises InputError."""
     if value not in ("raise", "witness", "stop"):
         raise InputError(
             "unknown on_failure", path="on_failure", got=value, expected="'raise', 'witness' or 'stop'"
@@ -28,14 +28,14 @@ def on_failure_value(value: str) -> OnFailure:
 
 
 def is_away(error: SpecshieldError) -> bool:
-    """Whether the error says that the service cannot answer now, and nothing of what was asked."""
+    """Whether the error means that the service cannot answer now, rather than that the request is wrong."""
     status = error.details.get("status")
     return isinstance(error, TransportError | LimitReached) or (isinstance(status, int) and status >= 500)
 
 
 @dataclass
 class Circuit:
-    """Whether it is worth asking: after a failure not before a pause, which grows up to LONGEST_PAUSE."""
+    """Says when to ask the service: after a failure only after a pause, which grows up to LONGEST_PAUSE."""
 
     clock: Callable[[], float] = time.monotonic
     pause: float = 0.0
@@ -43,7 +43,7 @@ class Circuit:
 
     @property
     def open(self) -> bool:
-        """Whether the last question was not answered."""
+        """Whether the last request was not answered."""
         return self.pause > 0.0
 
     @property
@@ -59,7 +59,7 @@ class Circuit:
 
 
 class Branch(NamedTuple):
-    """One way on: the pose x_t that was foreseen, and the actions from t to the rule's last step."""
+    """One way to go on: the foreseen pose x_t, and the actions from step t to the rule's last step."""
 
     pose: Pose
     plan: tuple[int, ...]
@@ -67,11 +67,11 @@ class Branch(NamedTuple):
 
 @dataclass
 class Continuation:
-    """The certified continuation received last, followed from pose to pose without a map.
+    """The latest certified continuation, followed from pose to pose without a map.
 
-    Where an action leads is taken from the service's answers: the longest displacement in the robot's frame
-    that `next_poses` ever showed, as a wall in the way makes it shorter. A continuation that itself runs into
-    something is therefore given up where it does, and the robot is told to stop.
+    The motion of an action is taken from the service's answers: the longest displacement in the robot's frame
+    that `next_poses` ever showed, since a wall in the way makes it shorter. So a continuation that runs into
+    something is given up there, and the robot is told to stop.
     """
 
     margin: float = 0.0  # [m]
@@ -79,7 +79,7 @@ class Continuation:
     motions: dict[int, Pose] = field(default_factory=dict)
 
     def learn(self, decision: Decision, pose: Pose) -> None:
-        """From the service's answer at `pose`. With `witnesses` a caller's own draw is followed as well."""
+        """Takes over the ways in the answer at `pose`: with `witnesses` one for each action."""
         for action, after in enumerate(decision.next_poses):
             motion = _difference(pose, after)
             if _length(motion) >= _length(self.motions.get(action, (0.0, 0.0, 0.0))):
@@ -92,7 +92,7 @@ class Continuation:
         )
 
     def at(self, pose: Pose) -> Branch | str:
-        """The way on from `pose`, or why there is none."""
+        """The branch that goes on from `pose`, or a text that says why there is none."""
         if not self.branches:
             return "the service has certified no continuation"
         branch = min(self.branches, key=lambda branch: _length(_difference(branch.pose, pose)))
@@ -106,7 +106,7 @@ class Continuation:
         return branch if branch.plan else ended
 
     def follow(self, pose: Pose) -> None:
-        """From `pose` the next action is run: what leads on is where that ends, or nothing from elsewhere."""
+        """Moves the branches on by the action that is run from `pose`; none are left if there is no way."""
         way = self.at(pose)
         self.branches = ()
         if isinstance(way, Branch) and way.plan[0] in self.motions:
@@ -114,7 +114,7 @@ class Continuation:
 
 
 def _difference(a: Pose, b: Pose) -> Pose:
-    """b as seen from a: ahead [m], to the left [m], turn in [-pi, pi]."""
+    """The pose b in the frame of a: ahead [m], to the left [m], turn in [-pi, pi]."""
     dx, dy, cos, sin = b[0] - a[0], b[1] - a[1], math.cos(a[2]), math.sin(a[2])
     return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(b[2] - a[2], 2.0 * math.pi)
 

@@ -1,8 +1,8 @@
-"""A network on which no try of the blocking client outlasts its time, whatever the other side does.
+"""Network connections that keep the time limit of a whole try, whatever the other side does.
 
-httpx limits each read and each write, so a server that drips bytes holds a call for ever. Here every
-operation on a connection, from looking up its name to the last byte, gets what is left of the whole try.
-With asyncio a try is cancelled.
+httpx limits each read and each write, so a server that sends a byte now and then holds a call for ever. Here
+each operation, from looking up the server's name to the last byte, gets the time that is left of the try.
+With asyncio the try is cancelled instead.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ import httpx
 
 T = TypeVar("T")
 ENDS: ContextVar[float] = ContextVar("ENDS", default=float("inf"))  # when this try ends, time.monotonic() [s]
-PARSING = 6e-6  # s a byte: h11 takes 1.3 to 3 us a byte of endless "100 Continue" (benchmarks/deadline.py)
-LEAST = 512  # bytes to read at once
+PARSING = 6e-6  # [s] a byte: h11 takes 1.3 to 3 us for endless "100 Continue" (benchmarks/deadline.py)
+LEAST = 512  # bytes that are read at once however little time is left
 OPTIONS = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
 
 
 def left(error: type[httpcore.TimeoutException], most: float | None = None) -> float:
-    """Seconds that are left of this try, at most `most`; `error` where none are."""
+    """The seconds that are left of this try, at most `most`. Raises `error` if none are left."""
     seconds = ENDS.get() - time.monotonic()
     if seconds <= 0.0:
         raise error("the time of this try is over")
@@ -41,7 +41,7 @@ def left(error: type[httpcore.TimeoutException], most: float | None = None) -> f
 
 
 def paced(most: int) -> int:
-    """How many bytes to read at once: no more than can be parsed in the time that is left."""
+    """How many bytes to read at once: at most `most`, and no more than can be parsed in the time left."""
     return max(min(most, LEAST), int(min(left(httpcore.ReadTimeout) / PARSING, most)))
 
 
@@ -62,7 +62,7 @@ class Stream(_Around, httpcore.NetworkStream):
         return bytes(self._inner.read(paced(max_bytes), left(httpcore.ReadTimeout, timeout)))
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
-        """Piece by piece, as the other side takes them."""
+        """Writes piece by piece, as the other side reads."""
         connection: socket.socket = self._inner.get_extra_info("socket")
         unsent = memoryview(buffer)
         try:
@@ -87,7 +87,7 @@ class Stream(_Around, httpcore.NetworkStream):
 
 
 class Network(httpcore.NetworkBackend):
-    """Connections to a server, tried at each of its addresses with an equal share of the time."""
+    """Connects to a server: tries each of its addresses, with equal shares of the time."""
 
     def connect_tcp(
         self,
@@ -114,7 +114,7 @@ class Network(httpcore.NetworkBackend):
 
 
 def look_up(host: str, port: int, by: float) -> list[str]:
-    """The addresses of a host. Nothing can limit the resolver's time, so a name is asked for in a thread."""
+    """The addresses of a host. A thread looks up a name, since the resolver takes no time limit."""
     with contextlib.suppress(ValueError):
         return [str(ip_address(host))]
     asked = in_thread(lambda: socket.getaddrinfo(host, port, type=socket.SOCK_STREAM), by)
@@ -129,9 +129,9 @@ def look_up(host: str, port: int, by: float) -> list[str]:
 def in_thread(
     function: Callable[[], T], by: float, late: Callable[[Future[T]], object] | None = None
 ) -> Future[T]:
-    """Runs a function in a thread, and waits until `by` (time.monotonic() [s]) for its future to be done. The
-    interpreter does not wait for the thread at its exit, as it would for an executor's. late: takes a future
-    that is done only after the wait, which an interrupt (Ctrl-C) may end as well.
+    """Runs a function in a thread, waits for it until `by` (time.monotonic() [s]), and returns its future.
+    The interpreter does not wait for the thread at its exit, as it would for an executor's thread. late: is
+    called with a future that is done only after the wait, which an interrupt (Ctrl-C) may end too.
     """
     given, done = Future[T](), set[Future[T]]()
 
@@ -151,7 +151,7 @@ def in_thread(
 
 
 class AsyncStream(_Around, httpcore.AsyncNetworkStream):
-    """One connection for asyncio, where a try is cancelled; only the size of what is read is bounded here."""
+    """One connection for asyncio. Only the size of each read is bounded: a late try is cancelled."""
 
     async def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
         return bytes(await self._inner.read(paced(max_bytes), timeout))
@@ -174,10 +174,9 @@ class AsyncNetwork(httpcore.AnyIOBackend):
 
 
 class Transport(httpx.HTTPTransport):
-    """httpx's own transport with the network above; an HTTP proxy of the environment is used.
+    """httpx's transport with the network above. It uses the HTTP proxy that the environment names.
 
-    A forked process shares its parent's connections, and requests that both send over one of them get mixed
-    up. So a forked process opens its own.
+    A forked process opens its own connections: requests of two processes over one connection get mixed up.
     """
 
     def __init__(self, url: httpx.URL) -> None:
@@ -196,7 +195,7 @@ class Transport(httpx.HTTPTransport):
 
 
 class AsyncTransport(threading.local, httpx.AsyncHTTPTransport):
-    """The same for asyncio. Each thread has its own connections, and opens new ones for another loop."""
+    """The same for asyncio. Each thread has its own connections, and opens new ones for each event loop."""
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
@@ -214,7 +213,7 @@ class AsyncTransport(threading.local, httpx.AsyncHTTPTransport):
 
 
 def _connect_by(transport: Any, url: httpx.URL, network: object, direct: Any, through_proxy: Any) -> None:
-    """Give it a pool with this network, as large as is asked for: a step never waits for those who watch."""
+    """Gives a transport an unlimited pool of connections on this network: no step waits for a free one."""
     if "_pool" not in vars(transport):
         raise RuntimeError(f"httpx {httpx.__version__} cannot be given a network; expected 0.27 or 0.28")
     proxy = _proxy(url)
@@ -226,12 +225,12 @@ def _connect_by(transport: Any, url: httpx.URL, network: object, direct: Any, th
 
 @cache
 def _certificates() -> ssl.SSLContext:
-    """Whom this machine trusts. Reading that takes 20 ms, so a process does it once and not once a client."""
+    """The certificates that this machine trusts. A process reads them once, since that takes 20 ms."""
     return httpx.create_ssl_context()
 
 
 def _proxy(url: httpx.URL) -> dict[str, Any]:
-    """What httpcore's proxies want to know, where the environment names one for this address."""
+    """The arguments of httpcore's proxy for this URL; {} if the environment names no proxy for it."""
     proxies = getproxies()
     named = proxies.get(url.scheme) or proxies.get("all")
     if not named or proxy_bypass(url.host):

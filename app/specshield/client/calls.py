@@ -1,6 +1,4 @@
-"""What can be asked of the service, one generator a call (core.py). The shells perform them: sync.py as they
-are here, aio.py with `await`.
-"""
+"""The calls of the service, each a generator (core.py) that the shells sync.py and aio.py perform."""
 
 from __future__ import annotations
 
@@ -18,14 +16,14 @@ from specshield.client.wire import Content, Failure, Numbers, Reply, Request
 from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
 
 log = logging.getLogger("specshield")
-READY_EVERY = 0.25  # s between two questions whether the server is ready
+READY_EVERY = 0.25  # [s] between two requests whether the server is ready
 
 
 def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     """Return when the server is ready to decide: its first start takes about a minute.
 
-    A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
-    which says how far the server was.
+    This also waits for a server that cannot be reached yet. Raises TransportTimeout after `timeout` [s], with
+    the progress of the server's start.
     """
     seconds = 0.0
     while True:
@@ -48,9 +46,9 @@ def validate(
     signals: Mapping[str, float] | None = None,
     map_id: str | None = None,
 ) -> Flow[Spec]:
-    """Parse a formula; FormulaError says where it is wrong.
+    """Parse a formula. Raises FormulaError, which says where the formula is wrong.
 
-    Once regions, signals or a map (whose rooms are names) are given, every name must be one of theirs.
+    If regions, signals or a map are given, every name must be one of theirs; a map's rooms are names too.
     """
     optional = {"regions": regions, "signals": signals, "map_id": map_id}
     body = {"formula": formula, **{name: value for name, value in optional.items() if value is not None}}
@@ -58,11 +56,11 @@ def validate(
 
 
 def create_map(format: str, **members: Any) -> Flow[Map]:
-    """Send a map in any format that the server has (its /docs lists them), by the format's own members.
+    """Send a map in any format of the server; its /docs lists the formats and their members.
 
-    A member `name` is what you call the map; the name is taken wherever its id is.
+    The member `name` is your name for the map, which you can use wherever its id is asked for.
 
-    A member that is bytes or the path object of a file makes all of them go as files, as `map_server` wants.
+    If a member is bytes or the path object of a file, all are sent as files, as `map_server` needs it.
     """
     if not any(isinstance(member, bytes | os.PathLike) for member in members.values()):
         return build(Map, (yield from call(wire.post("maps", body={"format": format, **members}, slow=True))))
@@ -72,7 +70,7 @@ def create_map(format: str, **members: Any) -> Flow[Map]:
 
 
 def upload_map(metadata: Content, image: Content, *, name: str | None = None) -> Flow[Map]:
-    """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
+    """Send a ROS map_server map: YAML, and PGM or PNG, each as content or as the path object of a file."""
     files = {"metadata": wire.content(metadata, "metadata"), "image": wire.content(image, "image")}
     return (yield from create_map("map_server", **files, **_named(name)))
 
@@ -84,13 +82,13 @@ def procthor_map(
     *,
     name: str | None = None,
 ) -> Flow[Map]:
-    """A ProcTHOR house, drawn at `resolution` [m]; map (x, y) is house (x, z)."""
+    """Send a ProcTHOR house, drawn with cells of `resolution` [m]; map (x, y) is house (x, z)."""
     members = {"house": house, "asset_sizes": asset_sizes, "resolution": resolution}
     return (yield from create_map("procthor", **members, **_named(name)))
 
 
 def occupancy_grid_map(info: Mapping[str, Any], data: Sequence[int], *, name: str | None = None) -> Flow[Map]:
-    """A nav_msgs/OccupancyGrid: its `info`, and `data` row by row from the lowest y."""
+    """Send a nav_msgs/OccupancyGrid: its `info`, and `data` row by row from the lowest y."""
     return (yield from create_map("occupancy_grid", info=info, data=data, **_named(name)))
 
 
@@ -99,17 +97,17 @@ def _named(name: str | None) -> dict[str, str]:
 
 
 def get_map(id: str) -> Flow[Map]:
-    """A map by its id or its name."""
+    """Read a map by its id or its name."""
     return build(Map, (yield from call(wire.get("maps", id))))
 
 
 def delete_map(id: str) -> Flow[None]:
-    """Remove a map. InUse while a policy is for it."""
+    """Remove a map. Raises InUse while a policy is for it."""
     return (yield from erase(Request("DELETE", wire.path("maps", id))))
 
 
 def map_image(id: str) -> Flow[bytes]:
-    """The map as PNG: white is free, black occupied."""
+    """The map as PNG: white cells are free, black ones occupied."""
     return (yield from fetch(wire.get("maps", id, "image.png", slow=True))).content
 
 
@@ -125,12 +123,12 @@ def create_policy(
     options: Mapping[str, Any] | None = None,
     name: str | None = None,
 ) -> Flow[Policy]:
-    """Have a policy made; returns at once (see `wait`). The same request again is the same policy.
+    """Have a policy made. Returns at once (see `wait`). The same request again returns the same policy.
 
-    `name` is what you call it; the name is taken wherever its id is.
+    `name` is your name for the policy, which you can use wherever its id is asked for.
 
-    `signals` names the other signals of the formula, with the value each holds before its first sample. The
-    server's /docs lists the methods that it has and the options of each.
+    `signals` has the other signals of the formula, each with its value before the first sample. The server's
+    /docs lists the methods and their options.
     """
     body = {
         "map_id": map_id,
@@ -145,7 +143,7 @@ def create_policy(
 
 
 def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[Policy]:
-    """A policy made elsewhere: safetensors and its card, each the content or a path object."""
+    """Send a policy made elsewhere: safetensors and its card, each as content or as a path object."""
     told = wire.encode(card) if isinstance(card, Mapping) else wire.content(card, "card")
     files = {
         "weights": ("policy.safetensors", wire.content(weights, "weights"), "application/octet-stream"),
@@ -155,19 +153,19 @@ def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[P
 
 
 def policy_image(id: str) -> Flow[bytes]:
-    """The floor as SVG, and from where the policy can keep the rule."""
+    """An SVG of the floor, with the starts from which the policy can keep the rule."""
     return (yield from fetch(wire.get("policies", id, "image.svg", slow=True))).content
 
 
 def get_policy(id: str) -> Flow[Policy]:
-    """A policy by its id or its name: how far it is, and what was measured."""
+    """Read a policy by its id or its name: the progress of its making, and what was measured of it."""
     return build(Policy, (yield from call(wire.get("policies", id))))
 
 
 def delete_policy(id: str) -> Flow[None]:
-    """Cancel its training, or remove it. InUse while sessions use it.
+    """Cancel the making of a policy, or remove it. Raises InUse while sessions use it.
 
-    Sent once: the first DELETE cancels a training, a second one would remove what is left of it.
+    The request is sent only once: the first DELETE cancels the making, and a second one removes the policy.
     """
     return (yield from erase(Request("DELETE", wire.path("policies", id), tries=1)))
 
@@ -179,10 +177,10 @@ def wait_policy(
     interval: float = 1.0,
     progress: Callable[[Policy], object] | None = None,
 ) -> Flow[Policy]:
-    """Ask every `interval` [s] until it is `ready` or `failed`; `progress` sees every answer.
+    """Read the policy every `interval` [s] until it is `ready` or `failed`; each answer goes to `progress`.
 
-    A server that goes away for a while is waited for, once it has answered. Raises TransportTimeout after
-    `timeout` [s]; the training goes on.
+    After its first answer the server may be away for a while. Raises TransportTimeout after `timeout` [s];
+    the making of the policy goes on.
     """
     seconds, policy = 0.0, None
     while True:
@@ -231,21 +229,21 @@ def create_session(
 ) -> Flow[SessionInfo]:
     """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
 
-    `threshold` is delta; the guarantee is for 1 with evaluation "feasibility", the defaults. With
-    "robustness" it is the mean robustness [m] asked for, of which 1 is often too much. `margin` and
-    `slack` are the robustness [m] and the steps to keep in hand. `shaping` is "projection" or one of the
-    preferences that the server's /docs lists.
-    Raises InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
+    `threshold` is delta. The guarantee holds for 1 with evaluation "feasibility", the defaults. With
+    evaluation "robustness" it is the mean robustness [m] to reach, for which 1 is often too much. `margin`
+    and `slack` are the robustness [m] and the steps to keep in reserve. `shaping` is "projection" or one of
+    the preferences that the server's /docs lists. Raises InfeasibleStart if no action has a satisfying
+    future, unless `allow_infeasible`.
 
-    `uncertainty`: "learned" has margin and slack follow from how the robot moves; {"translation": m,
-    "rotation": rad, "slip": probability} says what is known of it before the first step; "none" takes the
-    world for exact. `learn_map`: a motion that stops short marks what it ran into. `map_memory`: the steps
-    after which a point sent as `occupied` is forgotten, None: not for its age.
-    `threshold_over`: whether `threshold` holds at each "step" or over the whole "episode".
+    `uncertainty`: with "learned", margin and slack follow from how the robot moves; {"translation": m,
+    "rotation": rad, "slip": probability} is what is known of it before the first step; with "none", it is
+    taken to move exactly as described. `learn_map`: a motion that stops short marks what it ran into.
+    `map_memory`: the steps after which a point sent as `occupied` is forgotten; None: it is not forgotten for
+    its age. `threshold_over`: whether `threshold` holds at each "step" or over the whole "episode".
 
-    `on_failure` says what a step is when the service cannot answer it in time. "raise": its error. "witness":
-    a `LocalDecision` that follows the certified continuation received last; it says to stop where there is
-    none, where it has ended, and where the robot is not where it leads. "stop": one that says to stop.
+    `on_failure` says what `step` does when the service cannot answer in time. "raise": it raises the error.
+    "witness": it returns a `LocalDecision` that follows the latest certified continuation, or says to stop if
+    there is none, it has ended, or the robot has left it. "stop": it returns one that says to stop.
     """
     on_failure_value(on_failure)
     asked = policies_asked(policy_id, policy_ids)
@@ -270,35 +268,35 @@ def create_session(
     delivery = yield from deliver(wire.post("sessions", body=body, slow=True))
     try:
         return build(SessionInfo, wire.json_object(delivery.reply))
-    except SessionExists:  # after a lost answer of our own it is this very session, which is read back
+    except SessionExists:  # if an earlier try created this session and its answer was lost, it is read back
         if delivery.tries == 1:
             raise
         told = yield from call(wire.get("sessions", key))
-        if id is not None and not (yield from _begins(body, told)):  # the caller's id was in use before
+        if id is not None and not (yield from _begins(body, told)):  # the id belongs to another session
             raise
         return build(SessionInfo, told)
 
 
 def _begins(body: Mapping[str, Any], told: Mapping[str, Any]) -> Flow[bool]:
-    """Whether the session `told` of can be the one that `body` asked for: no step is taken yet, and policies
-    and settings are those asked for, as far as it tells of them.
+    """Whether the session `told` can be the one that `body` asked for: it has no decided step yet, and its
+    policies and settings, as far as it shows them, are those of the request.
     """
     if told.get("next_t") != 0:
         return False
     for name in (body.keys() & told.keys()) - {"policy_ids"}:
         asked, has = body[name], told[name]
         if isinstance(asked, dict) and isinstance(has, dict):
-            asked = {**has, **asked}  # what was left out has its default
+            asked = {**has, **asked}  # members that were left out have their defaults
         if asked != has:
             return False
     ids: list[str] = []
     for named in body.get("policy_ids") or [body["policy_id"]]:
-        ids += [(yield from get_policy(named)).id]  # it may have been asked for by its name
+        ids += [(yield from get_policy(named)).id]  # the request may name the policy by its name
     return ids == told.get("policy_ids")
 
 
 def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> dict[str, Any]:
-    """The member of a body that names the policies. InputError unless exactly one of the two is given."""
+    """The member of a request that names the policies. Raises InputError unless one of the two is given."""
     if (policy_id is None) == (policy_ids is None):
         raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
     if isinstance(policy_ids, str) or not isinstance(policy_ids, Iterable | None):  # letters are no ids
@@ -307,17 +305,17 @@ def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> d
 
 
 def get_session(id: str, *, on_failure: OnFailure = "raise") -> Flow[SessionInfo]:
-    """A session begun earlier, ready for its next step.
+    """Take up a session that was begun earlier, at its next step.
 
-    If the last action run was a terminal one, say `main_task_done=True` there: only the caller knows.
-    `on_failure` is as in `create`. With "witness" the certified continuation received last is read back too.
-    The poses of steps that the service has not heard of are not: `record` them again (`session.unsent`), or
-    the rule's clock falls behind.
+    If the last executed action was a terminal one, say `main_task_done=True` at the next step: only the
+    caller knows. `on_failure` is as in `create`; with "witness" the latest certified continuation is read
+    back too. Poses that were recorded but not sent (`session.unsent`) are lost with the old process: `record`
+    them again, or the rule's clock falls behind.
     """
     on_failure_value(on_failure)
     return build(SessionInfo, (yield from call(wire.get("sessions", id))))
 
 
 def delete_session(id: str) -> Flow[None]:
-    """Erase it with its trajectory."""
+    """Erase a session and its trajectory."""
     return (yield from erase(Request("DELETE", wire.path("sessions", id))))

@@ -1,15 +1,15 @@
-"""How a call of the SDK is made without I/O: a generator yields what to send and how long to wait.
+"""The calls of the SDK without I/O: each is a generator that yields what to send and how long to wait.
 
-A shell (sync.py, aio.py) performs a `Request` and sends its `Reply` or `Failure` in; it sleeps for a
-`Wait`; it reads `More` of an answer that is read while it comes (events.py). The generator's return value is
-the call's. So requests, parsing and retries exist once.
+A shell (sync.py, aio.py) performs a `Request` and sends the `Reply` or `Failure` into the generator; it
+sleeps for a `Wait`; for `More` it reads on in an answer that is read while it comes (events.py). The call
+returns what the generator returns. So requests, parsing and retries are written once.
 
-Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times, after
-0.05 s, 0.1 s, then every 0.2 s. No try starts later than four timeouts after the first, nor after the
-deadline of the call. All that is repeated is safe to repeat: steps are locked by t and content, maps and
-policies are addressed by content, and a session is created under an id the client chose. A server that
-says it is starting has done nothing yet: it is asked again when it says so (Retry-After), within the same
-four timeouts, and such an answer is not counted as a try.
+Retries: after a lost answer, a 502, 503 or 504, the same bytes are sent again, at most `tries` times, after
+0.05 s, 0.1 s, then every 0.2 s. No try starts later than four timeouts after the first one, nor after the
+call's deadline. Repeating is safe: a step is locked by its t and content, maps and policies are addressed by
+content, and a session is created under an id that the client chose. A server that is starting has done
+nothing yet: the request is sent again after the time that it says (Retry-After), within the same four
+timeouts, and this does not count as a try.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
     from specshield.client.models import Decision
 
-    D = Defaulted("D", default=Decision)  # what a step of a session gives
+    D = Defaulted("D", default=Decision)  # what a step of a session returns
 else:
     D = TypeVar("D")
 
 P = ParamSpec("P")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
-BACKOFF = 0.05  # s before the second try, doubled for each that follows
-LONGEST_WAIT = 0.2  # s before another try: a step takes a robot about as long. Chosen by hand.
-LONGEST_REST = 2.0  # s before another try to listen, which nothing waits for
+BACKOFF = 0.05  # [s] before the second try, doubled for each further one
+LONGEST_WAIT = 0.2  # [s] before another try: a robot's step takes about as long. Chosen by hand.
+LONGEST_REST = 2.0  # [s] before another try to connect to a stream of events, for which no robot waits
 PATIENCE = 4  # timeouts after which no further try starts
-LISTENING = 120.0  # s after which none does to listen again: longer than a server takes to come back
+LISTENING = 120.0  # [s], the same for streams of events: longer than a server takes to come back
 
 
 class Wait(NamedTuple):
@@ -46,25 +46,25 @@ class Wait(NamedTuple):
 
 
 class Within(NamedTuple):
-    """From its beginning to its end, this call may take so many seconds; None: five timeouts."""
+    """Limits the time of the whole call, from its beginning on [s]; None: five timeouts."""
 
     seconds: float | None
 
     def ends(self, began: float, timeout: float) -> float:
-        """On the clock on which the call began at `began`."""
+        """When the call has to end, on the clock by which it began at `began` [s]."""
         return began + ((PATIENCE + 1) * timeout if self.seconds is None else self.seconds)
 
 
 class Feed(NamedTuple):
-    """An answer that is read while it comes. pieces: an iterator of the shell's. close: leaves it."""
+    """An answer that is read while it comes. pieces: the shell's iterator over it. close: stops reading."""
 
     pieces: Any
     close: Callable[[], Any]
 
 
 class More(NamedTuple):
-    """The next piece of a feed, as the content of a Reply, by `ends` on the clock of time.monotonic(). It is
-    empty where the feed has ended, was lost or brought nothing in time; the feed is closed then.
+    """Asks for the next piece of a feed by the time `ends` of time.monotonic(). The shell sends a Reply whose
+    content is empty if the feed has ended, was lost or brought nothing in time; the feed is closed then.
     """
 
     feed: Feed
@@ -86,13 +86,13 @@ class Delivery(NamedTuple):
 
 
 def deliver(request: Request) -> Flow[Delivery]:
-    """Send until there is an answer worth having; TransportError where there is none."""
+    """Sends the request, and again where that may help. Raises TransportError if no answer comes."""
     tries, seconds = 0, 0.0
     while True:
         outcome = yield request
         seconds += outcome.seconds
         error: SpecshieldError | None = outcome.error if isinstance(outcome, Failure) else None
-        if isinstance(outcome, Reply) and outcome.status in (502, 503, 504):  # it is not there now
+        if isinstance(outcome, Reply) and outcome.status in (502, 503, 504):  # the server is not there now
             error = error_of(outcome)
         if isinstance(outcome, Reply) and isinstance(error, Starting):
             wait = _asked_for(outcome)
@@ -101,7 +101,7 @@ def deliver(request: Request) -> Flow[Delivery]:
             wait = min(BACKOFF * 2 ** (tries - 1), LONGEST_REST if request.listens else LONGEST_WAIT)
         patience = max(PATIENCE * outcome.timeout, LISTENING if request.listens else 0.0)
         late = seconds + wait > patience or wait >= outcome.left
-        passing = error is not None and not isinstance(error, TrainingUnavailable)  # it may go in a moment
+        passing = error is not None and not isinstance(error, TrainingUnavailable)  # another try may succeed
         if not passing or tries == request.tries or late:
             if isinstance(outcome, Failure):
                 outcome.error.details.update(tries=tries, seconds=round(seconds, 3))
@@ -115,12 +115,12 @@ def _asked_for(reply: Reply) -> float:
     """The pause that a starting server asks for [s]."""
     try:
         return max(BACKOFF, float(reply.headers.get("retry-after", "")))
-    except ValueError:  # none, or a date
+    except ValueError:  # there is no such header, or it holds a date
         return 1.0
 
 
 def fetch(request: Request) -> Flow[Reply]:
-    """The reply, which is not an error."""
+    """The reply. Raises the error that an unsuccessful reply stands for."""
     reply = (yield from deliver(request)).reply
     check(reply)
     return reply
@@ -131,7 +131,7 @@ def call(request: Request) -> Flow[dict[str, Any]]:
 
 
 def erase(request: Request) -> Flow[None]:
-    """DELETE; gone already, after a try of our own whose answer was lost, is gone."""
+    """Sends a DELETE. "Not found" counts as success if an earlier try may have deleted it."""
     delivery = yield from deliver(request)
     try:
         check(delivery.reply)
@@ -147,7 +147,7 @@ def page_of(cls: type[T], resource: str, cursor: str | None) -> Flow[Page[T]]:
 
 
 def looks_like(flow: Callable[..., Any], result: str = "") -> Callable[[F], F]:
-    """Gives a shell's method the name, docstring and parameters of its call. result: if not the call's."""
+    """Gives a shell's method the name, docstring and signature of its call. result: another return type."""
 
     def dress(method: F) -> F:
         given = inspect.signature(flow)

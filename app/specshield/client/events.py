@@ -1,7 +1,7 @@
-"""The decisions of a session as they are made, by whoever asks for them: server-sent events (docs/watch.md).
+"""Reads the decisions of a session from the server's stream of events (docs/watch.md), whoever steps it.
 
-Read without I/O, as calls are (core.py). A connection that ends without `event: end`, breaks, or brings no
-whole line for SILENCE seconds is given up, and the next one goes on after the last decision that was read.
+It does no I/O, like all calls (core.py). A connection that ends without `event: end`, breaks, or brings no
+whole line for SILENCE seconds is given up. The next one goes on after the last decision that was read.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from specshield.client.stream import LONGEST
 from specshield.client.wire import TRIES, Failure, Request, path
 from specshield.errors import ServerError
 
-SILENCE = 30.0  # s without a whole line; two of the server's heartbeats
-PAUSE = 1.0  # s before a lost connection is made again; the server asks for as much
-RESUMING = 100  # tries to make it again: more than come within LISTENING
+SILENCE = 30.0  # [s] without a whole line; two heartbeats of the server
+PAUSE = 1.0  # [s] before a lost connection is made again, as the server's `retry` says
+RESUMING = 100  # tries to make it again: more than fit into LISTENING
 
 
 class Events:
-    """What follows step `after` of a session. feed: the connection that is open, for the shell to close.
+    """The decisions after step `after` of a session. feed: the open connection, for the shell to close.
 
-    decided: the decision of an answer, by the contract's names. switched: takes the rule that a switch
-    brings.
+    decided: makes a decision of an answer (the contract's names). switched: called with the rule of a switch.
     """
 
     def __init__(
@@ -35,7 +34,7 @@ class Events:
         id: str,
         after: int,
         decided: Callable[[Mapping[str, Any]], Decision],
-        switched: Callable[[Mapping[str, Any]], object] = lambda rule: None,
+        switched: Callable[[Mapping[str, Any]], object],
     ) -> None:
         self._path, self._after, self._decided = path("sessions", id, "events"), after, decided
         self._switched = switched
@@ -44,7 +43,7 @@ class Events:
         self.feed: Feed | None = None
 
     def following(self) -> Flow[Decision | None]:
-        """The next decision; None where the session is over."""
+        """The next decision; None once the session is over."""
         ends = time.monotonic() + SILENCE
         while not self._found and not self._over:
             if self.feed is None:
@@ -73,7 +72,7 @@ class Events:
             raise ServerError(told, status=reply.status)
 
     def _lines(self, piece: bytes) -> list[bytes]:
-        """The lines that are whole now. Raises ServerError for one that is too long."""
+        """The lines that are complete now. Raises ServerError for a line that is too long."""
         self._rest += piece
         *whole, rest = bytes(self._rest).split(b"\n") if b"\n" in piece else [b""]
         if max(map(len, whole), default=len(self._rest)) > LONGEST or len(rest) > LONGEST:
@@ -98,7 +97,7 @@ class Events:
                 return
             decision = self._decided(json.loads(data))
         except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
-            told = f"the server told an event that this client does not understand: {error}"
+            told = f"the server sent an event that this client does not understand: {error}"
             raise ServerError(told) from error
         if decision.t > self._after:
             self._found.append(decision)

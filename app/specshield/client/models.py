@@ -1,7 +1,7 @@
-"""What the service answers, as frozen dataclasses whose fields are named as in the HTTP contract.
+"""The service's answers as frozen dataclasses, whose fields have the names of the HTTP contract.
 
-Lists arrive as tuples. Metres, radians, counter-clockwise, map frame. Fields this version does not
-know are ignored, so a newer server may add some.
+Lists become tuples. Metres, radians, counter-clockwise, map frame. Fields that this version does not know are
+ignored, so a newer server may add some.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ SpecStatus = Literal["pending", "satisfied", "violated"]
 
 @dataclass(frozen=True)
 class Spec:
-    """A formula the server has parsed: canonical text, horizon [steps], the names it uses, the methods that
-    take such a rule.
+    """A formula that the server has parsed: canonical text, horizon [steps], the names in it, and the methods
+    that can make policies for it.
     """
 
     formula: str
@@ -45,8 +45,8 @@ class Map:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed
-    or waits, `warnings` what there is to know of one that is ready, such as a rule that no start can keep.
+    """A policy pi_phi. progress: in [0, 1]. eta_s: estimated time left [s]. error: why it failed or waits.
+    warnings: of a ready policy, such as a rule that no start can keep.
     """
 
     id: str
@@ -70,7 +70,7 @@ class SessionInfo:
     spec: Mapping[str, Any]
     horizon: int
     actions: tuple[str, ...]
-    terminal_actions: tuple[int, ...]  # indices of those that end the main task
+    terminal_actions: tuple[int, ...]  # indices of the actions that end the main task
     next_t: int
     feasible: bool
     spec_status: SpecStatus
@@ -83,7 +83,7 @@ class SessionInfo:
 
 
 class Beginning(TypedDict, total=False):
-    """What `sessions.create` takes beside `on_failure`, for type checkers (calls.py says what each is)."""
+    """The options of `sessions.create` beside `on_failure`, for type checkers; calls.py describes them."""
 
     initial_pose: Any
     policy_id: str | None
@@ -113,9 +113,9 @@ class Residual:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why an action is forbidden: the part of the rule that its best future does not keep, its robustness
-    there [m], and by how many steps that future comes too late (None where time is not what is missing).
-    detail: what else there is to say, such as which half of an `until` fails, and when.
+    """Why an action is forbidden. conjunct: the part of the rule that its best future does not keep.
+    robustness: of that part [m]. late_by: by how many steps the future comes too late, None if time is not
+    the reason. detail: more in words, such as which half of an `until` fails, and when.
     """
 
     conjunct: str
@@ -139,11 +139,11 @@ class Explanation:
 
     @property
     def is_kept(self) -> bool:
-        """Whether the best future keeps it, though not as the session asks for."""
+        """Whether the best future keeps the conjunct, but with less reserve than the session asks for."""
         return self.robustness is not None and self.robustness > 0.0
 
     def beside(self, margin: float, slack: int) -> str:
-        """The line for people, in a session that asks for a margin [m] and slack [steps] beyond the rule."""
+        """The explanation as a line for people, in a session with this margin [m] and slack [steps]."""
         if not self.is_kept or self.detail is not None:
             return str(self)
         if slack and self.late_by is not None:
@@ -161,11 +161,11 @@ def _steps(count: int) -> str:
 
 @dataclass(frozen=True)
 class Decision:
-    """One decision at step `t`; the sequences without a comment have one entry an action.
+    """The decision of step `t`. Sequences without a comment have one entry for each action.
 
-    `execute` is the action to run: `action` as drawn, except that a terminal one is never run while
-    the specification is pending (then it is `completion_action`), and that once the specification is
-    settled and the main task over it is the terminal action: nothing is left to do.
+    `execute` is the action to run: `action` as drawn. But a terminal action is never run while the
+    specification is pending: `completion_action` is run then. Once the specification is settled and the main
+    task over, `execute` is the terminal action: nothing is left to do.
     """
 
     t: int
@@ -190,7 +190,7 @@ class Decision:
     witnesses: tuple[tuple[int, ...] | None, ...] | None = None
     warnings: tuple[str, ...] = ()  # what did not go as it should, such as a policy that was not used
     margin: float = 0.0  # [m] the robustness above 0 that J asked for
-    slack: int = 0  # [steps] that J asked to keep in hand
+    slack: int = 0  # [steps] the reserve before deadlines that J asked for
     threshold_left: float = 1.0  # of the next step
     map_revision: int = 0  # how often the session's own map has changed
     any_signal: bool | None = None  # whether the rule is kept whatever the signals do from here on
@@ -199,11 +199,11 @@ class Decision:
     source: Literal["service"] = "service"
 
     def why(self, action: int | str) -> str:
-        """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden: no
-        way was found after it that keeps the rule; the best way found does not keep 'F[50,100] Region2':
-        'Region2' is met at step 104, 4 steps too late". The step has to have asked: explain=True.
+        """Why an action, given by its index or its name, is forbidden, as a line for people: "m is forbidden:
+        no way was found after it that keeps the rule; the best way found does not keep 'F[50,100] Region2':
+        'Region2' is met at step 104, 4 steps too late". The step needs explain=True for that.
 
-        Raises InputError for an action that there is not.
+        Raises InputError for an action that does not exist.
         """
         count = len(self.j_values)
         i: Any = self.action_names.index(action) if action in self.action_names else action
@@ -224,20 +224,20 @@ class Decision:
 
 @dataclass(frozen=True)
 class LocalDecision:
-    """What a step is when the service cannot answer it, and `on_failure` is not "raise". Nothing was shaped.
+    """What `step` returns if the service cannot answer and `on_failure` is not "raise". Nothing was shaped.
 
-    source "witness": `execute` is the next action of the certified continuation received last. The step
-    counts: its pose is recorded, and told to the service later. source "stop": there is nothing certified to
-    do, so `execute` is None: the robot should stand. The step does not count: `t` stays, and a later `step`
-    asks for it anew. `reason` says why there is nothing, `error` why the service did not answer (None: it was
-    away a moment ago and was not asked this time).
+    source "witness": `execute` is the next action of the latest certified continuation. The step counts: its
+    pose is recorded, and sent to the service later. source "stop": no certified action is known, so `execute`
+    is None and the robot should stand. The step does not count: `t` stays, and a later `step` asks for it
+    again. `reason` says why no action is known, `error` why the service did not answer (None: it was away a
+    moment ago and was not asked this time).
     """
 
     t: int
     source: Literal["witness", "stop"]
     execute: int | None
     reason: str
-    spec_status: SpecStatus  # as the service said last
+    spec_status: SpecStatus  # of the service's last answer
     witness: tuple[int, ...] | None = None  # the actions that follow `execute` to the horizon
     next_pose: Pose | None = None  # where `execute` should lead
     finished: bool = False
@@ -246,7 +246,7 @@ class LocalDecision:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a closed session ended; the bounds are those of rho over all continuations, null is infinite."""
+    """How a closed session ended. The bounds are those of rho over all continuations; None is infinite."""
 
     spec_status: SpecStatus
     robustness_bounds: tuple[float | None, float | None]
@@ -254,18 +254,18 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TrajectoryItem:
-    """The state at `t`, and the answer given there by the contract's names; None where none was asked for."""
+    """The state at `t`, and the answer given there (the contract's names), None for a step without one."""
 
     t: int
     pose: Pose
     signals: Mapping[str, float]
     decision: Mapping[str, Any] | None
-    rule: int = 0  # which of the session's `rules` decides, or decided, this step
+    rule: int = 0  # index of the rule, among the session's `rules`, that decides or decided this step
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What a session knew of its map at step `t`: cells `row * width + column`, row 0 the lowest."""
+    """What a session had learned of its map by step `t`: cells `row * width + column`, row 0 the lowest."""
 
     t: int
     map_id: str
@@ -276,19 +276,19 @@ class Learned:
 
 @dataclass(frozen=True)
 class Page(Generic[T]):
-    """One page of a list; `next` asks for the following one."""
+    """One page of a list; `next` is the cursor of the next page."""
 
     items: tuple[T, ...]
     next: str | None
 
 
 def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
-    """`cls` from the members of `body` it knows; ServerError where one is missing."""
+    """An object of `cls` from the members of `body` that it knows. Raises ServerError if one is missing."""
     known = {f.name for f in fields(cls)} - more.keys()  # type: ignore[arg-type]
     try:
         return cls(**{name: _tuples(value) for name, value in body.items() if name in known}, **more)
     except (AttributeError, TypeError) as error:
-        told = f"the server answered a {cls.__name__.lower()} that this client does not understand: {error}"
+        told = f"the server sent a {cls.__name__.lower()} that this client does not understand: {error}"
         raise ServerError(told, got=body) from error
 
 
@@ -297,7 +297,7 @@ def _tuples(value: Any) -> Any:
 
 
 def execute_of(body: Mapping[str, Any], terminal: Sequence[int], over: bool) -> Any:
-    """`Decision.execute` of an answer. terminal: the actions that end the main task. over: whether it is."""
+    """`Decision.execute` of an answer. terminal: the terminal actions. over: whether the main task is."""
     action, pending = body.get("action"), body.get("spec_status") == "pending"
     if pending:
         return body.get("completion_action") if action in terminal else action
@@ -307,7 +307,7 @@ def execute_of(body: Mapping[str, Any], terminal: Sequence[int], over: bool) -> 
 def decision_of(
     body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
 ) -> Decision:
-    """Of an answer by the contract's names. over: whether the main task is."""
+    """The decision that an answer holds (the contract's names). over: whether the main task is over."""
     residual, told = body.get("residual"), body.get("explanations")
     explained = [None if why is None else build(Explanation, why) for why in told or ()]
     return build(
@@ -323,7 +323,7 @@ def decision_of(
 
 
 def under(info: SessionInfo, rules: Sequence[Mapping[str, Any]], t: int) -> SessionInfo:
-    """The session with the actions of the robot that step t was decided for."""
+    """`info` with the actions of the robot for which step t was decided."""
     rule = next((rule for rule in reversed(rules) if rule["from"] <= t), None)
     if rule is None:
         return info

@@ -1,4 +1,4 @@
-"""The calls of calls.py as methods of a client, whose `_run` performs them: blocking, or to be awaited."""
+"""The calls of calls.py as methods of a client, whose `_run` performs them, blocking or with `await`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     Awaiting: TypeAlias = "AsyncShieldClient | AsyncSession[Any] | Async"
 
     class Method(Protocol[P, T_co]):
-        """For type checkers: a method that gives T, or that is awaited for it in an asyncio client."""
+        """For type checkers: a method that returns T, or in an asyncio client an awaitable of T."""
 
         @overload
         def __get__(self, of: Blocking, owner: Any) -> Callable[P, T_co]: ...
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         def __get__(self, of: Awaiting, owner: Any) -> Callable[P, Coroutine[Any, Any, T_co]]: ...
 
     class Deciding(Protocol[P]):
-        """A method that gives what the steps of its session give."""
+        """A method that returns what the steps of its session return."""
 
         @overload
         def __get__(self, of: Session[D], owner: Any) -> Callable[P, D]: ...
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
         def __get__(self, of: AsyncSession[D], owner: Any) -> Callable[P, Coroutine[Any, Any, D]]: ...
 
     class Listing(Protocol[T_co]):
-        """A method that lists all there are."""
+        """A method that returns an iterator over all items."""
 
         @overload
         def __get__(self, of: Sync, owner: Any) -> Callable[[], Iterator[T_co]]: ...
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 
 class Resource(Generic[C]):
-    """Some of the calls, bound to a client."""
+    """The calls for one kind of thing, bound to a client."""
 
     def __init__(self, client: C) -> None:
         self._client: Any = client
@@ -64,7 +64,7 @@ class Resource(Generic[C]):
 
 
 def performing(flow: Callable[P, Flow[T]]) -> Method[P, T]:
-    """The method of a client, or of one of its resources, that makes this call."""
+    """A method of a client, or of one of its resources, that makes this call."""
 
     @looks_like(flow)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
@@ -74,7 +74,7 @@ def performing(flow: Callable[P, Flow[T]]) -> Method[P, T]:
 
 
 def stepping(flow: Callable[Concatenate[Any, P], Flow[T]]) -> Method[P, T]:
-    """The method of a session that makes this call, which is a method of its state."""
+    """A method of a session that makes this call, which is itself a method of `SessionState`."""
 
     @looks_like(flow)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
@@ -84,7 +84,7 @@ def stepping(flow: Callable[Concatenate[Any, P], Flow[T]]) -> Method[P, T]:
 
 
 def deciding(flow: Callable[Concatenate[Any, P], Flow[Any]]) -> Deciding[P]:
-    """As `stepping`, of the call whose answer is what the session's steps give."""
+    """As `stepping`, for the call that decides a step."""
     return cast("Deciding[P]", stepping(flow))
 
 
@@ -98,11 +98,11 @@ def listing(cls: type[T], resource: str) -> Listing[T]:
 
 
 def opening(flow: Callable[..., Flow[SessionInfo]]) -> Any:
-    """The method that makes this call and gives the session that it tells of."""
+    """A method that makes this call and returns the session that the answer describes."""
 
     def opened(client: Any, args: Any, given: dict[str, Any]) -> Flow[Any]:
         pose, on_failure = given.get("initial_pose"), given.get("on_failure", "raise")
-        if pose is not None:  # it may be one that can be gone through once
+        if pose is not None:  # it may be an iterator, which can be read only once
             given["initial_pose"] = pose = wire.pose_values(pose, "initial_pose")
         info = yield from flow(*args, **given)
         begun = client._session(client._run, info, pose, on_failure)

@@ -1,4 +1,4 @@
-"""A session as its caller sees it: which step is next, which poses the server has, what is over."""
+"""The state of a session on the caller's side: its next step, the poses that the server has, its verdict."""
 
 from __future__ import annotations
 
@@ -42,11 +42,10 @@ from specshield.errors import (
 
 
 class SessionState:
-    """What `Session` and `AsyncSession` share: all of it but the I/O.
+    """What `Session` and `AsyncSession` share: everything but the I/O.
 
-    `t` is the next step. A `step` that raises leaves everything as it was, so it may be called again
-    with the same pose and logits; or `record` takes the pose and moves on, and the next step that
-    reaches the server delivers it.
+    `t` is the next step. A `step` that raises changes nothing, so it may be called again with the same pose
+    and logits. Or call `record` with the pose and go on: the next step that reaches the server sends it too.
     """
 
     def __init__(
@@ -56,7 +55,7 @@ class SessionState:
         initial_pose: Numbers | None = None,
         on_failure: OnFailure = "raise",
     ) -> None:
-        """run: performs a call, as the shell does."""
+        """run: the client's function that performs a call."""
         self._run = run
         self.info = info
         self.on_failure = on_failure
@@ -65,13 +64,13 @@ class SessionState:
         self.finished = info.finished
         self.main_task_done = info.main_task_done
         self.closed = False
-        self._heard = list(info.rules)  # with those that `events` was told of
-        self._stored = info.next_t  # poses the server has, as far as is known
+        self._heard = list(info.rules)  # the rules, also those of which only `events` has told
+        self._stored = info.next_t  # the number of poses that the server has, as far as is known
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
         self._circuit = Circuit()
-        # The step, not passed over, of which the service may have an x_t that nobody here was told of: it was
-        # asked for without an answer, by whoever had the session before, or came with a switch.
+        # The step for which the service may have an x_t without our knowing: it was sent without an answer,
+        # by a former user of the session, or with a switch. -1: there is none.
         self._unanswered = info.next_t if initial_pose is None else -1
 
     def __repr__(self) -> str:
@@ -83,19 +82,19 @@ class SessionState:
         return self.info.id
 
     def rule_at(self, t: int) -> str:
-        """The rule that decides step t, as far as this session and its `events` have heard."""
+        """The rule that decides step t, as far as this object and its `events` know."""
         begun = [rule["formula"] for rule in self._heard if rule["from"] <= t]
         return str(begun[-1] if begun else self.info.spec["formula"])
 
     @property
     def unsent(self) -> dict[int, Pose]:
-        """The poses, by step, of steps that the service has not confirmed; `record` them after a restart."""
+        """The poses that the service has not confirmed, by step. `record` them again after a restart."""
         return {t: pose for t, pose in self._poses.items() if self._stored <= t < self.t}
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step that goes without a decision (the service was away), and move on to t + 1.
+        """Note x_t of a step without a decision, as the service was away, and go on to step t + 1.
 
-        Where x_t is on the certified continuation, its next action is taken to be the one that is run.
+        If x_t is on the certified continuation, the robot is taken to run the continuation's next action.
         """
         self._poses[self.t] = wire.pose_values(pose)
         self._continuation.follow(self._poses[self.t])
@@ -114,20 +113,19 @@ class SessionState:
         explain: bool = False,
         deadline: float | None = None,
     ) -> Flow[Decision | LocalDecision]:
-        """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
+        """Decide step t from x_t = (x, y, theta) and one logit for each action; run `decision.execute`.
 
-        `main_task_done`: leave it None to run `decision.execute`; the session then remembers a drawn
-        terminal action. A caller that draws from `decision.distribution` itself says True or False.
-        `logits` may be None once it is true. `deadline` [s] is a hard limit on the whole call, retries
-        included, whatever the server does; without one it is five timeouts of the client.
-        `occupied` and `free` are points (x, y) at which the robot's sensors see an obstacle or free floor
-        now, in the map frame; `explain` has the decision say of each forbidden action what it would break.
-        Raises whatever went wrong and stays at t: call again with the same pose and logits, or `record`
-        the pose and move on. With `on_failure` "witness" or "stop" it raises only what the caller got wrong;
-        where the service cannot answer, a `LocalDecision` says what to do. A `main_task_done` of True said
-        there is remembered; signals sent there are lost. While the service is known to be away, it is asked
-        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing, those that say to stop too: a
-        robot that stands asks again at its own pace.
+        `main_task_done`: leave it None if you run `decision.execute`; the session then remembers a drawn
+        terminal action. If you draw from `decision.distribution` yourself, say True or False. Once it is
+        true, `logits` may be None. `deadline` [s] is a hard limit on the whole call, retries included,
+        whatever the server does; by default it is five timeouts of the client. `occupied` and `free` are
+        points (x, y) in the map frame at which the robot's sensors see an obstacle or free floor now. With
+        `explain` the decision says of each forbidden action what it would break. An error leaves the session
+        at t: call again with the same pose and logits, or `record` the pose and go on. With `on_failure`
+        "witness" or "stop" only errors of the caller are raised; if the service cannot answer, a
+        `LocalDecision` says what to do. It remembers a `main_task_done` of True; signals are lost. While the
+        service is known to be away, it is asked with a single try, at pauses of 0.25 to 4 s; steps in between
+        return at once, also those that say to stop: a standing robot asks again at its own pace.
         """
         yield Within(None if deadline is None else wire.seconds_value(deadline, "deadline"))
         wire.check_flags(main_task_done=main_task_done, witnesses=witnesses, explain=explain)
@@ -171,7 +169,7 @@ class SessionState:
         return self._alone(x_t, way, body["main_task_done"], error)
 
     def _alone(self, x_t: Pose, way: Branch, over: bool, error: SpecshieldError | None) -> LocalDecision:
-        """Follow the certified continuation through this step."""
+        """The decision that follows the certified continuation at this step."""
         t, self.main_task_done = self.t, over
         self.record(x_t)
         reason = "the service cannot answer; the certified continuation is followed"
@@ -181,13 +179,14 @@ class SessionState:
         )
 
     def _ask(self, pose: Numbers | None, asking: Callable[[Pose | None], Flow[T]]) -> Flow[T]:
-        """What `asking` brings at t. Where the service has taken x_t here unheard, from another pose or with
-        other logits, the step is passed over: the robot stood, so its pose now is that of the step after.
+        """The result of `asking` for step t. If the service took this step before, with another pose or other
+        logits, and its answer was lost, the step is passed over: the robot stood, so its pose is that of the
+        next step.
         """
         x_t = None if pose is None else wire.pose_values(pose)
-        if self.on_failure == "raise":  # the caller is told what the service has, and goes on with `record`
+        if self.on_failure == "raise":  # the error says what the service has, and the caller uses `record`
             return (yield from asking(x_t))
-        asked, self._unanswered = self._unanswered, self.t  # until it is heard: a caller may cancel the step
+        asked, self._unanswered = self._unanswered, self.t  # until an answer comes: the step may be cancelled
         try:
             return (yield from asking(x_t))
         except SpecshieldError as error:
@@ -214,7 +213,7 @@ class SessionState:
         return decision
 
     def _recall(self) -> Flow[None]:
-        """After a restart of the robot's process: the certified continuation, from the answers kept."""
+        """Reads the certified continuation from the stored answers, after the robot's process began anew."""
         if self.on_failure != "witness" or self.finished:
             return
         for item in (yield from self._trajectory()) if self.t else ():
@@ -231,13 +230,13 @@ class SessionState:
         clock: Literal["keep", "restart"] = "keep",
         pose: Numbers | None = None,
     ) -> Flow[SessionInfo]:
-        """Go on under another rule, on another map or for another robot, from the next step on.
+        """Go on under another rule, on another map or with another robot, from the next step on.
 
-        `clock`: "keep" has the new rule's windows count from where those of the present one do, at first the
-        session's start; "restart" from the next step. `pose` is x_t where the robot is by now; without it the
-        service takes it to be where the last decision's action leads, and the step that follows tells.
-        A main task that is over stays over: what is left to do then is the new rule.
-        Raises InfeasibleSwitch where the new rule cannot be kept from there; nothing is changed then.
+        `clock`: with "keep" the new rule's windows count from the same step as the present rule's, at first
+        the session's start; with "restart" from the next step. `pose` is x_t, where the robot is now; without
+        it the service takes x_t to be where the last decision's action leads, and the next step shows the
+        true one. A main task that is over stays over: the robot then only has to keep the new rule. Raises
+        InfeasibleSwitch if the new rule cannot be kept from x_t; nothing is changed then.
         """
         body = {**policies_asked(policy_id, policy_ids), "clock": clock}
         return (yield from self._ask(pose, lambda x_t: self._switched(x_t, body)))
@@ -253,11 +252,11 @@ class SessionState:
         return info
 
     def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
-        """End the session; `pose` is the state the last action led to."""
+        """End the session; `pose` is the state to which the last action led."""
         return (yield from self._ask(pose, lambda x_t: self._close(x_t, TRIES)))
 
     def _close(self, x_t: Pose | None, tries: int) -> Flow[Verdict]:
-        """With no pose at hand (a session read back, not stepped) it closes on what the server has."""
+        """Closes the session, without a pose (as after reading it back) on the poses that the server has."""
         yield Within(None)
         poses = self._with(x_t)
         reply = yield from self._send("close", poses, max(poses, default=self.t), {}, tries)
@@ -267,8 +266,8 @@ class SessionState:
         return verdict
 
     def _leave(self, error: BaseException | None) -> Flow[None]:
-        """At the end of a block. An error of the block's own is what the caller must see: then one try,
-        whatever comes of it.
+        """Closes the session at the end of a `with` block. After an error in the block, which the caller has
+        to see, there is one try, and its own error is ignored.
         """
         if not self.closed:
             with contextlib.suppress(NotFound if error is None else SpecshieldError):
@@ -277,29 +276,29 @@ class SessionState:
     def _events(self, after: int | None) -> Events:
         def switched(rule: Mapping[str, Any]) -> None:
             same = itemgetter("from", "formula", "actions", "terminal_actions")
-            if same(rule) not in map(same, self._heard):  # else it is one of those that were known before
+            if same(rule) not in map(same, self._heard):  # else the rule was known before
                 insort(self._heard, rule, key=itemgetter("from"))
 
         def decided(answer: Mapping[str, Any]) -> Decision:
-            # Once the rule is settled, a session that is finished is one whose main task is over.
+            # Once the rule is settled, a session is finished exactly if its main task is over.
             then = under(self.info, self._heard, answer.get("t", 0))
             return decision_of(answer, then, bool(answer.get("finished")), {})
 
         return Events(self.id, self.t - 1 if after is None else after, decided, switched)
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
-        """The states x_0..x_t that the server has, and its answers."""
+        """The states x_0 .. x_t that the server has, with its answers."""
         body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True))
         return tuple(build(TrajectoryItem, item) for item in build(Page, body).items)
 
     def _learned(self) -> Flow[Learned]:
-        """The cells that the session found occupied or free though the map says otherwise."""
+        """The cells that the session found occupied or free, unlike the map."""
         return build(Learned, (yield from call(wire.get("sessions", self.id, "learned", slow=True))))
 
     def _save_record(self, path: str | os.PathLike[str]) -> Flow[str]:
-        """Write the session's record to a file, for `specshield verify`; the answer is its seal.
+        """Write the session's record to a file, for `specshield verify`, and return its seal.
 
-        Who keeps the seal can tell later that a record shown to them is this one.
+        With the seal you can check later that a record is this one.
         """
         reply = yield from fetch(wire.get("sessions", self.id, "record", slow=True))
         Path(path).write_bytes(reply.content)
@@ -313,14 +312,15 @@ class SessionState:
     close = stepping(_end)
 
     def _with(self, x_t: Pose | None) -> dict[int, Pose]:
-        """The poses known, and x_t where it is given."""
+        """The known poses, with x_t if it is given."""
         return self._poses if x_t is None else {**self._poses, self.t: x_t}
 
     def _send(
         self, action: str, poses: Mapping[int, Pose], t: int, body: Mapping[str, Any], tries: int = TRIES
     ) -> Flow[Reply]:
-        """Post the poses the server lacks up to x_t; on a gap once more, from where it says it stands. A pose
-        that it took with a step whose answer was lost stands, whatever was recorded of that step since.
+        """Sends the poses that the server lacks up to x_t; after a gap once more, from the pose that the
+        server names. If the server has taken another pose with a step whose answer was lost, the server's
+        pose counts.
         """
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
@@ -334,11 +334,11 @@ class SessionState:
             except HistoryGap as gap:
                 start, gaps = gap.details.get("expected_t", -1), gaps + 1
                 if gaps > 1 or not isinstance(start, int) or not all(i in poses for i in range(start, t + 1)):
-                    raise  # it lacks poses that this session, once read back, never had
+                    raise  # the server lacks poses that this object does not have either
             except HistoryConflict as conflict:
                 start = conflict.details.get("t", -1)
                 if not joined < start < self.t:
-                    raise  # it is x_t that differs
+                    raise  # x_t itself differs
                 poses[start], joined = wire.pose_values(conflict.details["stored"]), start
                 self._stored = max(self._stored, start + 1)
             else:

@@ -1,9 +1,9 @@
-"""Steps over one WebSocket a session, in MessagePack, for `ShieldClient(url, stream=True)`.
+"""Steps over one WebSocket for each session, in MessagePack, for `ShieldClient(url, stream=True)`.
 
-A message is the body of a step, its answer that of the answer or a problem document. A try has the same time
-as one over HTTP. A connection on which a try failed is left, so nothing that still comes on it is ever read,
-and the next try makes another; so is that of a session which is over. What is longer than `SHORT` goes over
-HTTP: a short message fits the socket's buffer, so sending it cannot block.
+A message is the body of a step; its answer is a message too, also a problem document. A try has the same time
+limit as over HTTP. After a failed try its connection is closed, so that a late answer is never read, and the
+next try makes a new one; the connection of a finished session is closed too. Steps longer than `SHORT` go
+over HTTP: a short message fits into the socket's buffer, so that sending it cannot block.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from specshield.errors import InputError
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection as Socket
 
-SHORT = 16_384  # bytes; chosen by hand, far below what the socket's buffer takes
-LONGEST = 4 << 20  # bytes of an answer; a step of 256 actions with all its witnesses has 1 MB
+SHORT = 16_384  # [bytes] chosen by hand, far below the size of the socket's buffer
+LONGEST = 4 << 20  # [bytes] of an answer; a step of 256 actions with all its witnesses has 1 MB
 PROBLEM = {"content-type": "application/problem+json"}
 
 
 def packed(request: Request) -> bytes | None:
-    """The message of a step; None for what goes over HTTP."""
+    """The message of a step; None for a request that goes over HTTP."""
     import msgpack
 
     if request.message is None:
@@ -43,25 +43,25 @@ def packed(request: Request) -> bytes | None:
 
 
 def leave(connection: Any) -> None:
-    """Without a closing handshake, which would wait for the other side."""
+    """Closes a connection without a handshake, which would wait for the other side."""
     with contextlib.suppress(OSError, AttributeError):
         connection.socket.shutdown(socket.SHUT_RDWR)
 
 
 def abort(connection: Any) -> None:
-    """The same with asyncio."""
+    """The same for asyncio."""
     with contextlib.suppress(AttributeError):
         connection.transport.abort()
 
 
 class Streams:
-    """What both shells share: where a session's stream is, and what an answer means."""
+    """What both shells share: the open connections, and how an answer is read."""
 
-    _here: Callable[[], Any]  # the process, or the loop, that a connection made now is of
-    _leave: Callable[[Any], None]  # gives a connection up
+    _here: Callable[[], Any]  # the process, or the event loop, to which new connections belong
+    _leave: Callable[[Any], None]  # closes a connection
 
     def __init__(self, http: httpx.Client | httpx.AsyncClient) -> None:
-        """InputError where the packages are missing."""
+        """Raises InputError if a package is missing."""
         try:
             import msgpack  # noqa: F401
             import websockets  # noqa: F401
@@ -70,7 +70,7 @@ class Streams:
             expected = "pip install 'specshield[stream]', or stream=False"
             raise InputError(told, path="stream", expected=expected) from error
         self._http = http
-        self._open: dict[tuple[Any, str], Any] = {}  # by what `_here` gives, and the path of the steps
+        self._open: dict[tuple[Any, str], Any] = {}  # by the result of `_here`, and the path of the steps
 
     def close(self) -> None:
         while self._open:
@@ -79,19 +79,19 @@ class Streams:
                 self._leave(connection)
 
     def end(self, request: Request) -> None:
-        """Leaves the stream of a session that this request closes or erases."""
+        """Closes the stream of a session if this request closes or erases the session."""
         if request.method != "GET":
             steps = request.path.removesuffix("/close") + "/steps"
             self._leave(self._open.pop((self._here(), steps), None))
 
     def _keep(self, connection: Any, path: str, reply: Reply | None) -> None:
-        """For the next step, where this one has an answer and the session is not over."""
+        """Keeps a connection for the next step; closes it without an answer, or if the session is over."""
         over = reply is None or reply.parsed.get("finished") or self._http.is_closed
         if over or self._open.setdefault((self._here(), path), connection) is not connection:
             self._leave(connection)
 
     def _options(self, exchange: Exchange) -> dict[str, Any]:
-        """Of websockets' `connect`."""
+        """The arguments of websockets' `connect`."""
         base = str(self._http.base_url.copy_with(scheme=self._http.base_url.scheme.replace("http", "ws")))
         key = self._http.headers.get("Authorization")
         return {
@@ -104,7 +104,7 @@ class Streams:
         }
 
     def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
-        """None for what is no answer, or one about another step."""
+        """The reply that a message holds; None if it is no answer, or is about another step."""
         import msgpack
 
         try:
@@ -118,7 +118,7 @@ class Streams:
 
 
 def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
-    """What a try came to on a connection that failed: an HTTP answer may have refused the handshake."""
+    """The outcome of a try whose connection failed. An HTTP answer may have refused the handshake."""
     answer = getattr(error, "response", None)
     if answer is None:
         return exchange.failure(httpx.ReadError(str(error)))
@@ -127,7 +127,7 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
 
 
 class SyncStreams(Streams):
-    """As with HTTP (bounded.py), a forked process opens its own connections."""
+    """As for HTTP (bounded.py), a forked process opens its own connections."""
 
     _here, _leave = staticmethod(os.getpid), staticmethod(leave)
 
@@ -149,7 +149,7 @@ class SyncStreams(Streams):
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     def _connected(self, exchange: Exchange) -> Socket:
-        """In a thread, since nothing can limit the time in which a name is looked up."""
+        """Connects in a thread, since looking up a name takes no time limit."""
         from websockets.sync.client import connect
 
         def late(made: Future[Socket]) -> None:
@@ -179,14 +179,14 @@ class AsyncStreams(Streams):
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     async def _asked(self, exchange: Exchange, message: bytes) -> Reply | None:
-        """The connection is kept only where it brought the answer: whoever cancels leaves it too."""
+        """Sends and receives. A connection without an answer is closed, also after a cancellation."""
         from websockets.asyncio.client import connect
 
         path, reply = exchange.request.path, None
         connection: Any = self._open.pop((self._here(), path), None)
         if connection is None:
             for other in [kept for kept in list(self._open) if kept[0].is_closed()]:
-                self._open.pop(other, None)  # each asyncio.run has a loop of its own
+                self._open.pop(other, None)  # connections of earlier calls of asyncio.run
             connection = await connect(**self._options(exchange)).__aenter__()
         try:
             await connection.send(message)

@@ -1,4 +1,4 @@
-"""ShieldClient: the shell that performs the core's requests with httpx and time.sleep."""
+"""ShieldClient: the shell that performs the requests of core.py with httpx and time.sleep."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 
 class ShieldClient:
-    """The service at `base_url`.
+    """A client of the service at `base_url`.
 
-    `timeout` [s] is what a decision may take, one try, from looking up the server's name to the last byte;
-    what prepares something (a map, a policy, a session, a switch) gets at least 30 s. Lost answers are asked
-    for again (see `core`), so a call returns or raises within five timeouts, a step within its `deadline`. A
-    `transport` of your own has to keep these times itself. Every error is a `SpecshieldError`; no answer is
-    a `TransportError`. `stream`: steps go over one WebSocket a session, in MessagePack, which is faster and
-    needs `pip install 'specshield[stream]'`.
+    `timeout` [s] is the time for one try of a decision, from looking up the server's name to the last byte.
+    Requests that prepare something (a map, a policy, a session, a switch) get at least 30 s. A request whose
+    answer is lost is sent again (see core.py), so a call returns or raises within five timeouts, a step
+    within its `deadline`. Your own `transport` has to keep these times itself. All errors are
+    `SpecshieldError`s; if no answer comes, it is a `TransportError`. `stream`: steps go over one WebSocket
+    for each session, in MessagePack, which is faster and needs `pip install 'specshield[stream]'`.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class ShieldClient:
         self._streams = SyncStreams(self._http) if stream else None
         self.specs, self.maps = Specs(self), Maps(self)
         self.policies, self.sessions = Policies(self), Sessions(self)
-        self._session = Session  # what `sessions` gives
+        self._session = Session  # the class of what `sessions` returns
 
     def __enter__(self) -> ShieldClient:
         return self
@@ -100,7 +100,7 @@ class ShieldClient:
                 if reply is not None and listens:
                     return replace(reply, feed=Feed(response.iter_bytes(), opened.pop_all().close))
                 if reply is None and "network_stream" in response.extensions:
-                    response.extensions["network_stream"].close()  # nothing more is read from it
+                    response.extensions["network_stream"].close()  # what still comes is never read
         except httpx.RequestError as error:
             return exchange.failure(error)
         finally:
@@ -127,7 +127,7 @@ class ShieldClient:
 
 
 class Session(SessionState, Generic[D]):
-    """A session; as a context manager it is closed at the end, and its trajectory stays."""
+    """A session. As a context manager it closes the session at the end; the trajectory is kept."""
 
     def __enter__(self) -> Session[D]:
         return self
@@ -136,12 +136,12 @@ class Session(SessionState, Generic[D]):
         self._run(self._leave(error))
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
-        """The decisions after step `after` as they are made, by whoever asks for them; -1: from the first.
+        """The decisions after step `after` as they are made, whoever steps the session; -1: from the first.
 
-        By default those after the last step that this session knows of. Each is what `step` gave, without its
-        `timings`. Waits for the next one, as long as the server answers; ends with the session. A connection
-        that is lost is made again, without a gap and without doubles; where that fails for two minutes, the
-        error is raised, and `events(decision.t)` goes on later.
+        By default they begin after the last step that this object knows of. Each is what `step` returned,
+        without its `timings`. The iterator waits for the next decision and ends with the session. A lost
+        connection is made again, with no decision left out and none twice. If that fails for two minutes, the
+        error is raised, and a later `events(decision.t)` goes on.
         """
         events = self._events(after)
         try:

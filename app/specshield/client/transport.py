@@ -1,4 +1,4 @@
-"""Where the SDK meets httpx: requests in its words, its replies and errors in ours."""
+"""Translates between the SDK and httpx: requests, replies and errors."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import httpx
 from specshield.client.wire import Failure, Reply, Request, stale
 from specshield.errors import InputError, TransportError, TransportTimeout
 
-PREPARING = 30.0  # s at least for what prepares something: a map, a policy, a session
-MOST = 64 << 20  # bytes of an answer; chosen by hand: a step of 256 actions with all its witnesses has 1 MB
-MOST_PREPARED = 1 << 30  # bytes of what prepares something, such as a long trajectory; chosen by hand
-UNDERSTANDING = 1e-7  # s a byte that are kept for parsing; json.loads of a step's answer took 55 ns a byte
-STALE = "the answer is to another request"
+PREPARING = 30.0  # [s] the least time for a request that prepares a map, a policy or a session
+MOST = 64 << 20  # [bytes] of an answer; chosen by hand: a step of 256 actions with all its witnesses has 1 MB
+MOST_PREPARED = 1 << 30  # [bytes] of the answer of a slow request, such as a long trajectory; chosen by hand
+UNDERSTANDING = 1e-7  # [s] kept for parsing each byte; json.loads of a step's answer took 55 ns a byte
+STALE = "the answer belongs to another request"
 MINE = "X-Request-Id"  # the server sends back what it was sent
 
 
 def address(base_url: str) -> httpx.URL:
-    """InputError unless it is the address of a server."""
+    """The address of a server as a URL. Raises InputError if it is none."""
     try:
         url = httpx.URL(base_url)
     except (httpx.InvalidURL, TypeError):  # TypeError: it is no text
@@ -34,20 +34,20 @@ def address(base_url: str) -> httpx.URL:
 
 
 def headers(api_key: str | None) -> dict[str, str]:
-    """InputError for a key that no header can carry."""
+    """The headers of every request. Raises InputError for a key that no header can hold."""
     sendable = isinstance(api_key, str) and re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key)
     if api_key is not None and not sendable:
         expected = "printable ASCII, with no space at either end"
         raise InputError("the API key cannot be sent in a header", path="api_key", expected=expected)
-    plain = {"Accept-Encoding": "identity"}  # what is compressed could be larger than it looks
+    plain = {"Accept-Encoding": "identity"}  # a small compressed answer could hold very much
     return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}
 
 
 class Exchange:
-    """One try: what httpx is to send, and what is made of that which comes back, in the time there is.
+    """One try of a request: its arguments for httpx, its time limit, and how its answer is read.
 
-    timeout: the client's. ends: of the call, on the clock of time.monotonic(). Raises TransportError where
-    the client is closed.
+    timeout: the client's [s]. ends: when the call has to end, on the clock of time.monotonic(). Raises
+    TransportError if the client is closed.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Exchange:
             raise TransportError("the client is closed", expected="a client that is still open")
         self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, http.base_url
         self._allowed = max(timeout, PREPARING) if request.slow else timeout
-        self.seconds = min(self._allowed, ends - self.began)  # what this try has; none if not above 0
+        self.seconds = min(self._allowed, ends - self.began)  # the time of this try; 0 or less: there is none
         self.ends = self.began + self.seconds
         self._most = MOST_PREPARED if request.slow else MOST
         self._id = secrets.token_hex(8)
@@ -65,7 +65,7 @@ class Exchange:
         self._size = 0
 
     def arguments(self, timeout: float) -> dict[str, Any]:
-        """The keywords of httpx's `stream`; connecting never gets more than `timeout`."""
+        """The arguments of httpx's `stream`. Connecting may never take longer than `timeout`."""
         request, headers = self.request, {MINE: self._id}
         if request.body is not None:
             headers["Content-Type"] = "application/json"
@@ -80,13 +80,13 @@ class Exchange:
         }
 
     def begin(self, response: httpx.Response) -> None:
-        """Raises httpx.DecodingError for a compressed body, which nobody asked for and may be a bomb."""
+        """Raises httpx.DecodingError for a compressed body: it was not asked for, and may hold very much."""
         encoding = response.headers.get("Content-Encoding", "identity")
         if encoding != "identity":
             raise httpx.DecodingError(f"the answer is compressed by {encoding}, which was not asked for")
 
     def take(self, chunk: bytes) -> None:
-        """A piece of the body. Raises httpx.ReadTimeout where too little time is left to understand it."""
+        """Takes a piece of the body. Raises httpx.ReadTimeout if too little time is left to parse it."""
         self._size += len(chunk)
         if self._size > self._most:
             raise httpx.ReadError(f"the answer has more than {self._most} bytes")
@@ -95,19 +95,19 @@ class Exchange:
         self._chunks.append(chunk)
 
     def reply(self, response: httpx.Response) -> Reply | None:
-        """None for an answer to another request: it came late, and its connection has to go."""
+        """The reply; None if it belongs to an earlier request, so that its connection has to be closed."""
         if response.headers.get(MINE, self._id) != self._id:
             return None
         reply = self.told(response, b"".join(self._chunks))
         return None if stale(self.request, reply) else reply
 
     def told(self, response: httpx.Response, content: bytes) -> Reply:
-        """A whole answer, such as the refusal of a WebSocket's handshake."""
+        """The reply with this body."""
         names = {name.lower(): value for name, value in response.headers.items()}
         return Reply(response.status_code, names, content, *self._taken())
 
     def streamed(self, status: int, headers: dict[str, str], document: Any) -> Reply | None:
-        """An answer that came as a message; None for one about another step."""
+        """The reply that came as a message of a stream; None if it is about another step."""
         reply = Reply(status, headers, b"", *self._taken(), parsed=document)
         return None if stale(self.request, reply) else reply
 
@@ -116,7 +116,7 @@ class Exchange:
         return now - self.began, self._allowed, self._ends - now
 
     def failure(self, error: httpx.RequestError) -> Failure:
-        """Every way httpx can fail to bring an answer is a TransportError; its own error is the cause."""
+        """The TransportError for any failure of httpx, whose error is the cause."""
         what = f"{self.request.method} {str(self._base_url).rstrip('/')}{self.request.path}"
         mapped: TransportError
         if isinstance(error, httpx.TimeoutException):

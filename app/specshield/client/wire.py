@@ -1,4 +1,4 @@
-"""Requests and replies as values: what is sent, what came back, and which error a reply stands for."""
+"""Requests and replies as values, the checks of what is sent, and the errors that replies stand for."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ Numbers = Iterable[float] | Array
 Logits = Iterable[float | None] | Array
 Points = Iterable[Numbers] | Array
 TRIES = 6
-FARTHEST = 1e8  # m, rad; beyond it a server takes no pose and no point
-LONGEST = 1e6  # s; a socket takes no timeout of more than 2**31 ms
+FARTHEST = 1e8  # [m], [rad]; a server takes no larger numbers in poses and points
+LONGEST = 1e6  # [s]; a socket takes no timeout of more than 2**31 ms
 Content = bytes | str | os.PathLike[str]
 
 
 class Request(NamedTuple):
-    """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most.
+    """One request. slow: the server has to prepare something. tries: how often it is sent at most.
 
-    `t`: the step that the answer has to be about; an answer about another one is none (see `stale`).
-    `message`: the body of a step, as a stream packs it. `listens`: a good answer is read while it comes.
+    t: the step that the answer has to be about (see `stale`). message: the body of a step, for a stream.
+    listens: a successful answer is read while it comes.
     """
 
     method: str
     path: str
-    body: bytes | None = None  # JSON, encoded once: every try sends the same bytes
+    body: bytes | None = None  # JSON, encoded once, so that every try sends the same bytes
     files: Mapping[str, tuple[str, bytes, str]] | None = None  # multipart: (file name, content, type)
     params: Mapping[str, str] | None = None
     slow: bool = False
@@ -70,7 +70,7 @@ class Request(NamedTuple):
 
 @dataclass(frozen=True)
 class Reply:
-    """What the server answered, after `seconds`, where `timeout` were allowed; `left`: of the call's time."""
+    """An answer that took `seconds` of its try's `timeout`. left: the seconds left of the call's time."""
 
     status: int
     headers: Mapping[str, str]  # names in lower case
@@ -78,12 +78,12 @@ class Reply:
     seconds: float
     timeout: float
     left: float = math.inf
-    parsed: Any = None  # what came as a message is not JSON, and has been read already
-    feed: Any = None  # core.Feed of an answer that is read while it comes
+    parsed: Any = None  # the content of an answer that came as a message of a stream, and not as JSON
+    feed: Any = None  # the core.Feed of an answer that is read while it comes
 
     @cached_property
     def document(self) -> Any:
-        """What the body says; None where it is not JSON."""
+        """The content of the body; None if it is not JSON."""
         if self.parsed is not None:
             return self.parsed
         try:
@@ -93,7 +93,7 @@ class Reply:
 
 
 class Failure(NamedTuple):
-    """No answer: the error, after `seconds`, where `timeout` were allowed; `left`: of the call's time."""
+    """A try without an answer; it took `seconds` of its `timeout`. left: seconds left of the call's time."""
 
     error: TransportError
     seconds: float
@@ -113,7 +113,7 @@ def post(
 
 
 def path(*segments: str) -> str:
-    """InputError for an id that would lead elsewhere: an empty one, `.`, `..` or one with a slash."""
+    """A path below /v1/. Raises InputError for an id that is empty, `.` or `..`, or has a slash."""
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", "..") or "/" in segment:
             told, expected = "this cannot be an id or a name", "an id or a name that the server gave"
@@ -122,7 +122,7 @@ def path(*segments: str) -> str:
 
 
 def encode(body: Mapping[str, Any]) -> bytes:
-    """JSON; arrays become lists. InputError for what JSON cannot hold (NaN, infinity, other objects)."""
+    """The body as JSON; arrays become lists. Raises InputError for NaN, infinity and other objects."""
     members, name = list[str](), "body"
     try:
         for name, value in body.items():
@@ -143,7 +143,7 @@ _json = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=_listed
 
 
 def content(source: Content, where: str) -> bytes:
-    """The bytes of a file (a path object), of a text, or as given. InputError where a file cannot be read."""
+    """The bytes of a file (a path object) or a text, or the given bytes. Raises InputError."""
     if isinstance(source, os.PathLike):
         try:
             return Path(source).read_bytes()
@@ -154,13 +154,13 @@ def content(source: Content, where: str) -> bytes:
 
 
 def pose_values(pose: Numbers, where: str = "pose") -> Pose:
-    """(x, y, theta) in [m], [m], [rad]. PoseError unless these are three numbers up to `FARTHEST`."""
+    """(x, y, theta) in [m, m, rad]. Raises PoseError unless these are three numbers up to `FARTHEST`."""
     x, y, theta = _finite(pose, PoseError, where, "a pose is three finite numbers x, y, theta", 3)
     return x, y, theta
 
 
 def point_values(points: Points, where: str) -> list[list[float]]:
-    """Points (x, y) in metres, map frame. InputError unless each is two numbers up to `FARTHEST`."""
+    """Points (x, y) [m], map frame. Raises InputError unless each is two numbers up to `FARTHEST`."""
     listed = points.tolist() if isinstance(points, Array) else points
     if not isinstance(listed, Iterable):
         raise InputError("these are no points", path=where, got=listed, expected="a list of points [x, y]")
@@ -179,7 +179,7 @@ def _finite(
 
 
 def logit_values(logits: Logits) -> list[float | None]:
-    """One logit an action; minus infinity becomes null. LogitsError for NaN and plus infinity."""
+    """One logit for each action; minus infinity becomes None. Raises LogitsError for NaN and +infinity."""
     values = _floats(logits, LogitsError, "logits", "one number an action")
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
@@ -189,7 +189,7 @@ def logit_values(logits: Logits) -> list[float | None]:
 
 
 def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
-    """SampleError unless every signal is a finite number."""
+    """The samples by name. Raises SampleError unless all are finite numbers."""
     if not isinstance(signals, Mapping):
         raise SampleError("these are no signals", path="signals", got=signals, expected="numbers by name")
     told, most = "a signal is a finite number", sys.float_info.max
@@ -207,7 +207,7 @@ def check_flags(**flags: object) -> None:
 
 
 def seconds_value(seconds: object, name: str) -> float:
-    """InputError unless it is a positive number of seconds; what is longer than any wait is `LONGEST`."""
+    """The seconds, at most `LONGEST`. Raises InputError unless they are a positive number."""
     value = float(seconds) if isinstance(seconds, Real) else math.nan
     if not 0.0 < value < math.inf:
         expected = "a number above 0"
@@ -216,9 +216,9 @@ def seconds_value(seconds: object, name: str) -> float:
 
 
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
-    """None is minus infinity, of a logit; nothing else may be None."""
+    """The values as floats. None becomes minus infinity among logits, and is an error elsewhere."""
     listed = values.tolist() if hasattr(values, "tolist") else values
-    if isinstance(values, str | Mapping | Set):  # these could be gone through, but not as numbers in order
+    if isinstance(values, str | Mapping | Set):  # they can be iterated over, but are no ordered numbers
         listed = [values]
     try:
         return [-math.inf if value is None and error is LogitsError else float(value) for value in listed]
@@ -234,7 +234,7 @@ _GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: Transport
 
 
 def json_object(reply: Reply) -> dict[str, Any]:
-    """The object a successful reply holds; the error an unsuccessful one stands for is raised."""
+    """The JSON object of a successful reply. Raises the error that an unsuccessful one stands for."""
     check(reply)
     body = reply.document
     if not isinstance(body, dict):
@@ -244,21 +244,21 @@ def json_object(reply: Reply) -> dict[str, Any]:
 
 
 def check(reply: Reply) -> None:
-    """Raise the error an unsuccessful reply stands for."""
+    """Raises the error that an unsuccessful reply stands for."""
     if not 200 <= reply.status < 300:
         raise error_of(reply)
 
 
 def error_of(reply: Reply) -> SpecshieldError:
-    """The class its problem document's `type` names (RFC 9457), holding all the document says."""
+    """The error that a problem document (RFC 9457) describes: its class by `type`, with all its members."""
     problem = reply.headers.get("content-type", "").startswith("application/problem+json")
     document = reply.document if problem and isinstance(reply.document, dict) else None
-    if document is None and reply.status in _GATEWAY:  # something in front of the server spoke
+    if document is None and reply.status in _GATEWAY:  # a proxy in front of the server has answered
         return _GATEWAY[reply.status](
             f"the server cannot be reached: status {reply.status}", status=reply.status
         )
     if document is None:
-        document = {"title": f"status {reply.status}, and no more", "expected": "a specshield server there"}
+        document = {"detail": f"status {reply.status} without a problem", "expected": "a specshield server"}
     default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
     cls = _BY_TYPE.get(str(document.get("type")), default)
     message = str(document.get("detail") or document.get("title") or f"status {reply.status}")
@@ -271,15 +271,15 @@ def error_of(reply: Reply) -> SpecshieldError:
 
 
 def stale(request: Request, reply: Reply) -> bool:
-    """Whether the reply decides another step than the one that was asked for."""
+    """Whether the reply is the decision of another step than the one that was asked for."""
     if request.t is None or reply.status != 200 or not isinstance(reply.document, dict):
         return False
     return bool(reply.document.get("t") != request.t)
 
 
 def timings(reply: Reply) -> dict[str, float]:
-    """`total;dur=2.1, rollout;dur="1.5"` as {"total": 2.1, "rollout": 1.5}, in ms; what is no number is left
-    out, as whatever stands in front of the server may add to the header.
+    """The header Server-Timing, `total;dur=2.1, rollout;dur="1.5"`, as {"total": 2.1, "rollout": 1.5} [ms].
+    Other entries are left out: a proxy in front of the server may add some.
     """
     entries = {}
     for metric in reply.headers.get("server-timing", "").split(","):
