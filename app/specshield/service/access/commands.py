@@ -47,13 +47,13 @@ def show() -> None:
 
 @app.command()
 def revoke(name: Name) -> None:
-    """Take a key back: servers refuse it within 2 s. What was made with it stays."""
+    """Revoke a key: servers refuse it within 2 s. What was made with it is kept."""
     on_keys(lambda keys: keys.revoke(name))
     print(f"the key {name} is revoked")
 
 
 def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None) -> R:
-    """What the action answers, with the store open meanwhile. Raises StoreError."""
+    """The result of an action on the keys of the store. Raises StoreError."""
     from specshield.service.access.keys import Keys
     from specshield.service.settings import read_settings
     from specshield.service.storage.connect import connect, naming

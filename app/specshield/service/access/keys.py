@@ -1,8 +1,8 @@
-"""API keys with names. The store holds a hash of each, and what it may use; a key itself is shown once.
+"""API keys, each with a name. The store holds their digests and limits; a key itself is shown only once.
 
-They are in one hash of the store, `specshield:keys`, by name; the field "" has another token after each
-change. A server keeps all of them in memory and asks every REFRESH seconds whether they have changed. So a
-request costs no trip to the store, whatever key it shows, and a revoked key works no longer than that.
+The store has them in the hash `specshield:keys`, by name; its field "" gets a new token with each change. A
+server keeps all keys in memory and asks every REFRESH seconds whether they have changed. So requests need no
+round trip to the store, whatever key they show, and a revoked key works for no longer than that.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from typing import Any, TypeVar
 
 from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
 from specshield.service.library.files import now
+from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.storage.connect import reaching
 
 T = TypeVar("T")
 KEYS = "specshield:keys"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
 REVOKE = "return redis.call('HDEL', KEYS[1], ARGV[1]) > 0 and redis.call('HSET', KEYS[1], '', ARGV[2])"
-MOST_KEYS = 1000  # each takes some 300 bytes of every server; chosen by hand
-REFRESH = 2.0  # [s] chosen by hand: how long a revoked key may still work
-MISS_EVERY = 0.2  # [s] at most so often do keys that are not known make a server ask the store; by hand
+MOST_KEYS = 1000  # each takes some 300 bytes of every server's memory; chosen by hand
+REFRESH = 2.0  # [s] for which a revoked key may still work; chosen by hand
+MISS_EVERY = 0.2  # [s] between two looks at the store for unknown keys, at least; chosen by hand
 log = logging.getLogger("specshield")
 
 
 @dataclass(frozen=True)
 class Key:
-    """digest: SHA-256 of the key in hex; a key has 256 random bits, so that one plain hash is enough.
+    """digest: SHA-256 of the key in hex; since a key has 256 random bits, a plain hash is safe.
 
-    requests: the most a second, for each server process; steps are counted apart, against the same number.
-    sessions: the most kept. bytes: the most on disk. None is no limit of its own.
+    requests: the most in a second, for each server process; steps are counted separately, up to the same
+    number. sessions: the most that are kept. bytes: the most on the disk. None: the key has no such limit.
     """
 
     name: str
@@ -51,8 +52,8 @@ class Key:
 
 
 class Keys:
-    """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits; unless the store has it
-    too, as it may where a command starts a server of its own. store: redis.asyncio.
+    """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits, unless the store has the
+    same key (a command that starts a server may use one). store: a client of redis.asyncio.
     """
 
     def __init__(self, store: Any, own: str | None = None) -> None:
@@ -66,9 +67,9 @@ class Keys:
     # --- for servers
 
     async def check(self, authorization: bytes) -> Key:
-        """The key that a request shows. Raises Unauthorized, and StoreError while no key can be known."""
+        """The key that a request shows. Raises Unauthorized, and StoreError if the keys are not known yet."""
         scheme, _, given = authorization.partition(b" ")
-        # The digest is looked up, not the key: how long that takes tells nothing of a key.
+        # Looking up the digest takes a time that tells nothing about the key.
         digest = digest_of(given.strip()) if scheme.lower() == b"bearer" else ""
         found = self._known.get(digest)
         if found is None and (given or not self._read):
@@ -78,13 +79,13 @@ class Keys:
             if self._read and not self._own and self._version is None:
                 return OPEN
             if not (self._read or self._own):
-                raise StoreError("the store cannot be reached: which keys there are is not known yet")
+                raise StoreError("the store cannot be reached, so the API keys are not known yet")
             what = "the API key is not one of this server's" if digest else "an API key is needed"
             raise Unauthorized(what, path="Authorization", expected="Bearer <key>")
         return found
 
     async def until_refused(self, authorization: bytes) -> None:
-        """Returns once the key that a request showed is refused. It is looked up when keys have changed."""
+        """Returns once the key that a request showed is refused. It is checked after each change of keys."""
         with contextlib.suppress(Unauthorized):
             while True:
                 changed = self._changed
@@ -92,8 +93,8 @@ class Keys:
                 await changed.wait()
 
     async def refresh(self) -> None:
-        """Reads the keys where they have changed; all who ask for that within MISS_EVERY share one reading.
-        Without the store, what was read last holds. Once there was a key, the server is never open again.
+        """Reads the keys if they have changed; calls within MISS_EVERY share one reading. While the store is
+        away, the last reading counts. Once there has been a key, requests always need one.
         """
         asked_at = time.monotonic()
         async with self._lock:
@@ -116,7 +117,7 @@ class Keys:
             self._tried_at = began
 
     async def follow(self) -> None:
-        """Keeps to what the store says, until it is cancelled."""
+        """Refreshes the keys until it is cancelled."""
         while True:
             await self.refresh()
             await asyncio.sleep(REFRESH)
@@ -128,27 +129,26 @@ class Keys:
         return sorted((Key(**json.loads(v)) for k, v in found.items() if k), key=lambda key: key.name)
 
     async def create(self, name: str, **limits: Any) -> str:
-        """The key itself, which cannot be read again. Raises InputError for a name that cannot be had."""
-        if not NAME.fullmatch(name):
-            expected = "1 to 64 letters a to z, digits, '_', '.' or '-', the first a letter or digit"
-            raise InputError("a key cannot have this name", path="name", got=name, expected=expected)
+        """Makes a key and returns it: it cannot be read again. Raises InputError and LimitReached."""
+        if not re.fullmatch(ID, name):
+            raise InputError("a key cannot have this name", path="name", got=name, expected=ID_TOLD)
         if await _reached(self._store.hlen(KEYS)) > MOST_KEYS:
             raise LimitReached(f"there are {MOST_KEYS} keys", expected="room for one more: revoke one")
         secret = f"ss_{secrets.token_urlsafe(32)}"
         record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
-            expected = "another; or revoke that one first"
+            expected = "another name, or that key revoked first"
             raise InputError("there is a key of this name", path="name", got=name, expected=expected)
         await _reached(self._store.hset(KEYS, "", secrets.token_hex(8)))
         return secret
 
     async def revoke(self, name: str) -> None:
-        """What it made stays, and belongs to the next key of this name. All or nothing. Raises NotFound."""
+        """Revokes a key. What was made with it belongs to the next key of this name. Raises NotFound."""
         if not name or await _reached(self._store.eval(REVOKE, 1, KEYS, name, secrets.token_hex(8))) is None:
-            raise NotFound("there is no such key", path="name", got=name, expected="a name of `keys list`")
+            raise NotFound("there is no such key", path="name", got=name, expected="a name in `keys list`")
 
 
-OPEN = Key("", "")  # whoever asks a server that asks for no key
+OPEN = Key("", "")  # stands for all callers of a server that asks for no key
 
 
 def digest_of(key: bytes) -> str:

@@ -1,6 +1,6 @@
-"""Whose a thing is. An owner is the name of the API key that made it; "" where the server asks for none, and
-for the key of SPECSHIELD_API_KEY. A session's key in the store is `owner@id`: two owners may choose the same
-id, and another's session is not there.
+"""Owners. The owner of a thing is the name of the API key that made it, or "" if the server asks for no key
+or the key was that of SPECSHIELD_API_KEY. A session's key in the store is `owner@id`, so two owners may
+choose the same id, and nobody finds the session of another owner.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def scoped(owner: str, id: str) -> str:
 
 
 def shown(key: str) -> str:
-    """The id that a caller knows: `scoped` undone."""
+    """The id, as callers know it, in a session's key."""
     return key.partition("@")[2]
 
 

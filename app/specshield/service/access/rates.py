@@ -1,4 +1,4 @@
-"""How many requests a second a key may make: two buckets of tokens a key, in the memory of each process."""
+"""Limits the requests that a key may make in a second: two token buckets for each key, in each process."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from specshield.service.access.keys import Key
 
 
 class Rates:
-    """Steps have a bucket of their own: whatever else a key is used for, its robots go on. A bucket holds a
-    second's worth of requests at most: what was left of them, and when that was [s].
+    """Steps have their own bucket, so that the robots of a key go on whatever else the key is used for. A
+    bucket is the number of requests that were left, at most those of a second, and when that was [s].
     """
 
     def __init__(self) -> None:
-        self._buckets: dict[tuple[str, bool], tuple[float, float]] = {}  # as many as there are keys, twice
+        self._buckets: dict[tuple[str, bool], tuple[float, float]] = {}  # by the key's name, and for steps
 
     def take(self, key: Key, step: bool) -> None:
-        """Raises RateLimited, with the seconds to wait."""
+        """Counts a request. Raises RateLimited, with the seconds to wait."""
         rate = key.requests
         if rate is None:
             return
@@ -27,8 +27,8 @@ class Rates:
         left = min(most, left + (now - then) * rate)
         if left < 1.0:
             raise RateLimited(
-                f"the key {key.name!r} may make {rate:g} requests a second",
-                expected="to be asked again after Retry-After",
+                f"the key {key.name!r} may make {rate:g} requests in a second",
+                expected="the request again after Retry-After",
                 retry_after=math.ceil((1.0 - left) / rate),
             )
         self._buckets[key.name, step] = left - 1.0, now

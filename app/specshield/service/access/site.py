@@ -1,16 +1,16 @@
-"""Where a request was sent to and which page sent it: what a browser's own rules do not keep out.
+"""Refuses requests that a web page of another origin makes a browser send here.
 
 Any web page may make its visitor's browser send requests to this machine. The page cannot read the answers,
 unless its own name is made to point here (DNS rebinding): the Host header then holds that name. So:
 
-- Host has to name the server. On a connection to a loopback address: `localhost`, `127.0.0.1` or `[::1]` with
-  the server's port. On any other, where a balancer or a port mapping may stand in between: any literal
-  address or `localhost`, since neither can be made to point elsewhere; so a probe may ask a pod by its
-  address. Other names are those of SPECSHIELD_ALLOWED_HOSTS. A unix socket takes any: no browser reaches it.
-- Origin, which a browser sends with whatever may change something, has to be the server itself. So has the
-  page by Sec-Fetch-Site, unless a person follows a link.
-- A body has to be declared as what it is. The types that a page may send without asking first are not taken,
-  but for the multipart of an upload, which the rule on Origin covers.
+- Host has to name the server. On a connection to a loopback address, it is `localhost`, `127.0.0.1` or
+  `[::1]`, with the server's port. On others, which may come through a balancer or a port mapping, it is any
+  literal address or `localhost`, since nobody can make these point elsewhere; so a probe may use a pod's
+  address. SPECSHIELD_ALLOWED_HOSTS has further names. A unix socket takes any Host: no browser reaches it.
+- Origin, which a browser sends with every request that may change something, has to be the server itself. So
+  has Sec-Fetch-Site, unless a person follows a link.
+- A body needs its own Content-Type. Types that a page may send without asking first are refused, except the
+  multipart form of an upload, for which the rule on Origin is enough.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Headers = Mapping[bytes, bytes]  # names in lower case
 
 
 def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[str]) -> None:
-    """Raises MisdirectedRequest, CrossSite or UnsupportedMediaType. allowed: names with or without a port."""
+    """Raises MisdirectedRequest, CrossSite or UnsupportedMediaType. allowed: names, perhaps with a port."""
     host = headers.get(b"host", b"").decode("latin-1").lower()
     server = scope.get("server") or ("", None)
     if not names_server(host, server[0], server[1], allowed):
@@ -54,7 +54,7 @@ def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[st
 
 @lru_cache(4096)
 def names_server(host: str, address: str, port: int | None, allowed: frozenset[str]) -> bool:
-    """Whether `host`, as in the header, names the server behind a socket of this address.
+    """Whether the header Host names the server behind a socket of this address.
 
     >>> names_server("localhost:8000", "127.0.0.1", 8000, frozenset())
     True
@@ -71,7 +71,7 @@ def names_server(host: str, address: str, port: int | None, allowed: frozenset[s
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches what listens on this address or name."""
+    """Whether only this machine can reach a server that listens on this address or name."""
     found = _literal(host)
     if found is None:
         return host == "localhost"
@@ -105,6 +105,6 @@ def _check_type(path: str, declared: str) -> None:
     elif path.endswith("/steps"):
         taken.append("application/msgpack")
     if kind not in taken and not JSON.fullmatch(kind):
-        told = "the body is not declared as a type that is taken here"
+        told = "the body's Content-Type is not accepted here"
         expected = f"the header Content-Type: {' or '.join(taken)}"
         raise UnsupportedMediaType(told, path="Content-Type", got=declared, expected=expected)

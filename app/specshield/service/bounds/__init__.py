@@ -1,1 +1,1 @@
-"""What one caller may take of the server: connections, headers, bytes of bodies, time to send them."""
+"""Limits on what callers may use: connections, headers, bytes of bodies, and the time to send them."""

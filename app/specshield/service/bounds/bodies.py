@@ -1,7 +1,7 @@
-"""Takes in the body of each request before the application sees it, within bounds.
+"""Receives the body of each request within limits, before the application sees the request.
 
-So no route waits for bytes, a client that goes away in the middle of a body has asked for nothing, and large
-bodies are on the disk, for the process that parses them.
+So no route waits for bytes, a request whose client leaves in the middle of the body has no effect, and large
+bodies are on the disk for the process that parses them.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from specshield.service.bounds.protocol import ARRIVED
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings
 
-LONG = ("/steps", "/close", "/switch", "/validate")  # a history, or a formula with its regions
-LONG_JSON = 16 << 10  # [bytes]; what is shorter has no room for many members
+LONG = ("/steps", "/close", "/switch", "/validate")  # bodies with a history, or a formula with regions
+LONG_JSON = 16 << 10  # [bytes]; a shorter body has no room for many members
 
 
 class Bodies:
-    """Puts a `Body` into `scope["state"]["body"]` for uploads; other routes receive theirs in one piece."""
+    """Puts the `Body` of an upload into `scope["state"]["body"]`; other routes get theirs in one message."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self.app = app
@@ -42,7 +42,7 @@ class Bodies:
         upload = path in UPLOADS
         announced = _header(scope, b"content-length")
         if ARRIVED in scope["state"] and not upload and announced.isdigit() and int(announced) <= self._short:
-            await self._pass_on(scope, receive, send)  # too short for any bound below: nearly every step
+            await self._pass_on(scope, receive, send)  # nearly every step: too short for the limits below
             return
         body = Body(self._budget, self._folder, _header(scope, b"content-type"))
         try:
@@ -53,7 +53,7 @@ class Bodies:
                 if not upload:
                     self._check_members(body.content)
             except SpecshieldError as error:
-                # What is still to come of the body is not waited for.
+                # The rest of the body is not read.
                 await problems.ProblemResponse(error, {"Connection": "close"})(scope, receive, send)
                 return
             if upload:
@@ -65,7 +65,7 @@ class Bodies:
             body.close()
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """The request, whose body is here in one piece."""
+        """Passes on a request whose body has arrived in one piece."""
         message = await receive()
         if message["type"] == "http.disconnect":
             scope["state"]["status"] = CLIENT_GONE
@@ -78,7 +78,7 @@ class Bodies:
         return self._max_body if path.endswith(LONG) else min(self._max_body, FREE)
 
     async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
-        """Whether all of it came; else the client has gone."""
+        """Receives a body of at most `limit` bytes. False if the client has left."""
         announced = _header(scope, b"content-length") or "0"
         if announced.isdigit() and int(announced) > limit:
             raise _too_large(limit)
@@ -105,13 +105,13 @@ class Bodies:
             ) from None
 
     def _check_members(self, content: bytes | Path) -> None:
-        """A schema says of each member that it does not know it: thousands would take long to say so."""
+        """Raises InputError for too many members: a schema makes an error for each unknown one."""
         if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > self._members:
             raise InputError(
                 "the body has too many members",
                 path="body",
                 got=content.count(b":"),
-                expected=f"at most {self._members}, and no more colons than that in texts",
+                expected=f"at most {self._members}, where colons in texts count too",
             )
 
 
@@ -120,7 +120,7 @@ def _too_large(limit: int) -> BodyTooLarge:
 
 
 def _replay(content: bytes | Path, receive: Receive) -> Receive:
-    """The body in one message, then what the client does, which is to go away."""
+    """A `receive` that gives the body in one message, and then waits until the client leaves."""
     given = False
 
     async def replay() -> Message:

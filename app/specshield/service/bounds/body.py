@@ -1,5 +1,5 @@
-"""One request's body as it comes in: in memory while it is small, in a file beyond that. What all of them
-together may hold is bounded.
+"""The body of a request that is being received: in memory while it is small, else in a file. A budget limits
+all bodies together.
 """
 
 from __future__ import annotations
@@ -16,22 +16,21 @@ from starlette.requests import Request
 
 from specshield.errors import Busy
 
-FREE = 64 << 10  # [bytes] of each body that no budget counts: a step fits, whatever others send
-IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they go to its file
+FREE = 64 << 10  # [bytes] of each body that the budget does not count, so that steps are always taken
+IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they are written to its file
 
 
 class Budget:
-    """Bytes that requests may hold at once, all of them together."""
+    """The bytes that the bodies of all requests together may have."""
 
     def __init__(self, limit: int) -> None:
         self._left = limit
 
     def take(self, size: int) -> None:
-        """Raises Busy where there is no room for so many bytes."""
+        """Raises Busy if so many bytes are not left."""
         if size > self._left:
             raise Busy(
-                "the server holds as many bytes of requests as it may",
-                expected="the request again, in a while",
+                "the server cannot hold more bytes of requests now", expected="the request again in a while"
             )
         self._left -= size
 
@@ -41,7 +40,7 @@ class Budget:
 
 @dataclass
 class Body:
-    """folder: where the file of a large body goes. `close` gives everything back."""
+    """folder: for the file of a large body. `close` removes the file and gives the bytes back."""
 
     budget: Budget
     folder: Path
@@ -51,7 +50,7 @@ class Body:
     _file: Any = None
 
     async def add(self, chunk: bytes) -> None:
-        """Raises Busy where the requests together hold too much."""
+        """Raises Busy if the bodies of all requests together have too many bytes."""
         counted = max(self.size - FREE, 0)
         self.budget.take(max(self.size + len(chunk) - FREE, 0) - counted)
         self.size += len(chunk)
@@ -60,7 +59,7 @@ class Body:
             await self._write()
 
     async def end(self) -> None:
-        """No more will come."""
+        """To be called after the last `add`."""
         if self._file is not None:
             await self._write()
             self._file.flush()
@@ -86,13 +85,13 @@ class Body:
 
 
 def received(request: Request) -> Body:
-    """The body of an upload, which bodies.py has taken in."""
+    """The body of an upload, which bodies.py has received."""
     body: Body = request.scope["state"]["body"]
     return body
 
 
 def clear(folder: Path) -> None:
-    """Removes what servers that were killed have left: no body takes an hour."""
+    """Removes files that are older than an hour: they are left from servers that were killed."""
     for path in folder.glob("*"):
         with contextlib.suppress(OSError):
             if path.stat().st_mtime < time.time() - 3600:

@@ -1,7 +1,7 @@
-"""uvicorn's protocols, with bounds of connections, heads, what is left unread and what a WebSocket may send.
+"""uvicorn's protocols with limits on connections, request heads, unread answers and messages of WebSockets.
 
-What uvicorn does without these was measured: a head of 100 MB is taken in whole, a connection that sends or
-reads nothing, or a byte now and then, stays for good, and a flood of pings held up all others for 7 s.
+Without them, as was measured, uvicorn reads a head of 100 MB as a whole, keeps a connection for ever that
+sends or reads nothing, or a byte now and then, and during a flood of pings answers nobody else for 7 s.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from specshield.errors import Busy, HeadersTooLarge, InputError, RequestTimeout,
 from specshield.service import metrics, problems
 from specshield.service.settings import Settings
 
-ARRIVED = "arrived"  # in `scope["state"]` once all of a request is here: no wait for it needs a limit
-PIECE = 2048  # [bytes]; chosen by hand: a step fits, and as many pings as fit take some 5 ms
-AT_ONCE = 1 << 16  # [bytes] of an answer: what is larger gains nothing by waiting
-KEPT_FILES = 256  # descriptors for the store, files and child processes
+ARRIVED = "arrived"  # in `scope["state"]` once the whole request is here, so that no wait needs a limit
+PIECE = 2048  # [bytes]; chosen by hand: a step fits, and the pings that fit take some 5 ms
+AT_ONCE = 1 << 16  # [bytes] of an answer that are sent at once: waiting for more would gain nothing
+KEPT_FILES = 256  # file descriptors for the store, files and child processes
 
 
 @cache
@@ -32,26 +32,26 @@ def _settings() -> Settings:
 
 @cache
 def most_connections() -> int:
-    """As many as the settings say, unless the process may not open so many files."""
+    """The number in the settings, or fewer if the process may not open so many files."""
     return min(
         _settings().max_connections, max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] - KEPT_FILES, 16)
     )
 
 
 def raise_file_limit() -> None:
-    """A process begins with a limit that is lower than the one that it may set itself."""
+    """Raises this process's limit on open files to the highest that it may set."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """A connection waits until the head of its first request is there. When there are too many, the one that
-    has waited longest makes room for a new one; where none waits, the new one is refused. So those who open
-    connections and say nothing are the first to lose them, and robots that are at work keep theirs.
-    A WebSocket waits too, once it has brought no message for as long as one is kept without a request.
+    """A connection counts as waiting until the head of its first request has arrived. If there are too many
+    connections, the one that has waited longest is closed for a new one; if none waits, the new one is
+    refused. So callers that send nothing are the first to lose their connections, and working robots keep
+    theirs. A WebSocket counts as waiting too, once it has had no message for `keep_alive_timeout` seconds.
     """
 
-    # Of the whole process, the oldest first.
+    # The waiting connections of the process, the oldest first.
     waiting: dict[BoundedProtocol | BoundedStream, None] = {}  # noqa: RUF012
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -60,7 +60,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
         self.transport = cast(asyncio.Transport, Corked(transport, self.loop))
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: so long may a client read nothing of what waits
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # on Linux: how long a client may leave an answer unread
             patience = int(1000 * _settings().request_timeout)
             transport.get_extra_info("socket").setsockopt(socket.SOL_TCP, socket.TCP_USER_TIMEOUT, patience)
         if len(self.connections) > most_connections():
@@ -78,7 +78,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if self._in_head:  # of a head that came in one piece, `on_header` counts what is in it
+        if self._in_head:  # `on_header` counts a head that came in one piece
             self._head += len(data)
             if self._head > self._most:
                 self._refuse_head()
@@ -94,8 +94,8 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_header(self, name: bytes, value: bytes) -> None:
         self._head += len(name) + len(value)
-        if self._head > 2 * self._most:  # a byte may have been counted as it came, too
-            raise ValueError("the head is too large")  # ends the parsing: `send_400_response` comes next
+        if self._head > 2 * self._most:  # `data_received` may have counted the same bytes
+            raise ValueError("the head is too large")  # ends the parsing: uvicorn calls `send_400_response`
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -111,7 +111,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._upgraded = True
         super().handle_websocket_upgrade()
         opening = self.transport.get_protocol()
-        if not getattr(opening, "handshake_initiated", True):  # nothing would answer it, or end it
+        if not getattr(opening, "handshake_initiated", True):  # nothing else would answer or end it
             expected = "a GET of HTTP/1.1 without a body, which opens a WebSocket"
             self._refuse(InputError("the request cannot open a WebSocket", expected=expected))
 
@@ -142,7 +142,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self._late = None
 
     def _refuse(self, error: SpecshieldError) -> None:
-        """Answers and closes, without the application."""
+        """Sends a problem and closes the connection, without the application."""
         self._stop_waiting()
         metrics.refused(error.type)
         answer = problems.ProblemResponse(error, {"Connection": "close"})
@@ -153,7 +153,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
 
 class BoundedStream(WebSocketsSansIOProtocol):
-    """Takes what came piece by piece, and others come between: uvicorn takes 40,000 messages in one go."""
+    """Handles what arrived piece by piece, so that others can run: uvicorn takes 40,000 messages at once."""
 
     _rest = b""
 
@@ -171,7 +171,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
             self.loop.call_soon(self.data_received)
 
     def shutdown(self) -> None:
-        """An open stream ends itself, after the step that is being decided: `leaving.Streams`."""
+        """An open stream ends itself after the step that is being decided (`leaving.Streams`)."""
         if self.close_sent or not self.handshake_complete:
             super().shutdown()
 
@@ -190,11 +190,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
 
 
 class Corked:
-    """A transport that sends what is written in one go together: the head of an answer and its body. It
-    leaves when the event loop comes round, before that reads anything more.
+    """A transport that sends an answer's head and body together, in the next round of the event loop and
+    before that reads more.
 
-    uvloop writes at once, so uvicorn's two writes an answer are two system calls, of which each costs as much
-    as parsing a request (measured with py-spy under `python -m benchmarks.step_cost`).
+    uvloop sends at once, so that uvicorn's two writes for an answer are two system calls, each of which takes
+    as long as parsing a request (measured with py-spy under `python -m benchmarks.step_cost`).
     """
 
     def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:

@@ -1,5 +1,5 @@
-"""The API's description: what FastAPI makes of the routes, the answers that are the same for all of them,
-and with examples: of each answer one that a server gave, of each problem one of its type.
+"""The API's description: FastAPI's own, with the problems that all routes may answer, and with examples: for
+each answer one that a server gave, and for each problem one of its type.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from specshield.service.state import problem_documents
 TAGS = [
     {"name": "specifications", "description": "Formulas of Signal Temporal Logic."},
     {"name": "maps", "description": "Occupancy grids with named areas."},
-    {"name": "robots", "description": "What the robots that came with the server can do."},
-    {"name": "policies", "description": "What certifies that an action still has a satisfying future."},
-    {"name": "sessions", "description": "Episodes: one robot, one specification, one decision a step."},
-    {"name": "system", "description": "Life, readiness, metrics."},
+    {"name": "robots", "description": "The robots that came with the server."},
+    {"name": "policies", "description": "Policies propose the futures that certify actions."},
+    {"name": "sessions", "description": "Episodes: one robot, one specification, one decision at each step."},
+    {"name": "system", "description": "Liveness, readiness, metrics."},
 ]
 
-LINKS = {  # which answers name a thing, by what parameter, and the operations on that thing
+LINKS = {  # of answers that name a thing: the parameter for its id, and the operations on it
     ("/v1/maps", "201"): ("map_id", ("maps_read", "maps_image")),
     ("/v1/policies", "202"): ("policy_id", ("policies_read",)),
     ("/v1/sessions", "201"): (
@@ -42,11 +42,11 @@ def _read(name: str) -> Any:
     return json.loads((Path(__file__).parent / name).read_text())
 
 
-# By operation: what the requests of `examples` were answered, as tests/service/test_docs.py records it
+# For each operation the answers to the requests of `examples`, as tests/service/test_docs.py records them.
 ANSWERS = _read("answers.json")
-# The problem of a status where its description names none: the last one in the table.
+# The problem that stands for a status whose description names none: the last one in the table.
 USUAL = {str(status): kind.type for kind, status in problems.STATUS.items()}
-WRONG = {  # what of bad input an operation has of its own
+WRONG = {  # the problems with bad input that only one operation has
     "specifications_validate": ["invalid-formula"],
     "maps_create": ["invalid-map"],
     "policies_create": ["invalid-formula", "outside-fragment"],
@@ -57,26 +57,26 @@ WRONG = {  # what of bad input an operation has of its own
 
 
 def described(app: FastAPI) -> dict[str, Any]:
-    """OpenAPI, made once."""
+    """The OpenAPI description, made at the first call."""
     if app.openapi_schema is None:
         schema = FastAPI.openapi(app)
         schemas = schema["components"]["schemas"]
-        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which never leave it
+        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which no route answers
             schemas.pop(name, None)
-        for model in (Problem, SpecRequest, PolicyRequest):  # referred to by hand
+        for model in (Problem, SpecRequest, PolicyRequest):  # the routes refer to these by name
             described = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described
         schema["components"]["securitySchemes"] = {
-            "key": {"type": "http", "scheme": "bearer", "description": "Where the server asks for one."}
+            "key": {"type": "http", "scheme": "bearer", "description": "If the server asks for one."}
         }
         schema["security"] = [{}, {"key": []}]
-        for path, methods in schema["paths"].items():  # what the middleware may answer
+        for path, methods in schema["paths"].items():  # the answers of the middlewares
             for operation in methods.values():
-                said = {"_403": "`cross-site`: a page of another origin asks."}
+                said = {"_403": "`cross-site`: a page of another origin sent the request."}
                 said["_421"] = "`misdirected-request`: Host does not name this server."
                 if guarded(path):
-                    said["_401"] = "The server asks for a key, and this is not it."
+                    said["_401"] = "The server asks for a key, and the request has no valid one."
                     said["_429"] = operation["responses"].get("429", {}).get("description", "")
                     said["_429"] = f"{said['_429']} `rate-limited`: wait for Retry-After.".strip()
                 if path.startswith("/v1/"):
@@ -85,7 +85,7 @@ def described(app: FastAPI) -> dict[str, Any]:
                 if "requestBody" in operation:
                     said["_408"] = "The body took too long to arrive."
                     said["_413"] = "The body is over the limit."
-                    said["_415"] = "The body is not declared as a type that is taken here."
+                    said["_415"] = "The body's Content-Type is not accepted here."
                 added = problem_documents(**said)
                 operation["responses"] |= {str(status): told for status, told in added.items()}
         for (path, status), (parameter, operations) in LINKS.items():
@@ -115,14 +115,14 @@ def _show(operation: dict[str, Any], answered: Any) -> None:
             form = content["application/problem+json"]  # one for all statuses, as it comes
             response["content"] = {"application/problem+json": {**form, "examples": shown}}
         elif answered is not None:
-            for kind in sorted(content, key="application/json".__ne__):  # /docs asks for the first of them
+            for kind in sorted(content, key="application/json".__ne__):  # /docs uses the first one
                 content[kind] = form = content.pop(kind)
                 if kind in answered:
                     form["example"] = answered[kind]
 
 
 def _problem(told: dict[str, Any]) -> dict[str, Any]:
-    """With the title and the status that its type has."""
+    """The example with the title and the status of its type."""
     made = next(kind for kind in tree() if kind.type == told["type"])("")
     return {"type": told["type"], "title": "", "status": 0, **problems.document(made), **told}
 

@@ -1,1 +1,1 @@
-"""Work that takes the interpreter for long: it runs in other processes, bounded in time and in memory."""
+"""Work that takes long: it runs in other processes, with limits on time and memory."""

@@ -1,4 +1,4 @@
-"""Calls that take seconds, made in turn, in a thread that a server which stops does not wait for."""
+"""Makes calls that take seconds, one after the other, in a thread that does not delay the server's end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Background:
-    """As an executor with one thread; but the interpreter waits for an executor's threads when it ends."""
+    """Like an executor with one thread, but the interpreter does not wait for the thread at its end."""
 
     def __init__(self, name: str) -> None:
         self._name, self._calls, self._lock = name, SimpleQueue[Callable[[], None]](), Lock()
@@ -32,7 +32,7 @@ class Background:
         with self._lock:
             if self._thread is None:
                 thread = Thread(target=self._run, name=self._name, daemon=True)
-                thread.start()  # may fail, and is tried again with the next call
+                thread.start()  # may fail; the next call then tries again
                 self._thread = thread
         self._calls.put(call)
         return future

@@ -1,10 +1,10 @@
-"""The processes that heavy work runs in: a template that has everything imported, and forks of it.
+"""The processes for heavy work: a template that has imported everything, and forks of it.
 
     python -m specshield.service.heavy.child     # the template; standard input is a socket from the server
 
-For each message that the server sends there, with a socket attached, the template forks. A fork takes 10 ms,
-where importing the core takes a second. The fork serves calls on its socket, one after the other. All of them
-end when the server closes their socket, or is gone.
+The template forks for each message from the server, which has a socket attached. A fork takes 10 ms, while
+importing the core takes a second. The fork serves calls on its socket, one after the other. Each process ends
+when the server closes its socket or ends.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ LENGTH = struct.Struct("<Q")
 def template(control: socket.socket) -> None:
     settings = Settings()
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
-    gc.set_threshold(50_000)  # objects: what is imported stays, and to look at it took a quarter of the time
+    gc.set_threshold(50_000)  # [objects]: collections took a quarter of the time, and modules are never freed
     importlib.import_module("specshield.service.heavy.uploads")
-    gc.freeze()  # the forks leave these pages as they are, and share them
+    gc.freeze()  # so that collections in the forks do not write to these pages, which all forks share
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the forks
     while True:
@@ -47,25 +47,25 @@ def template(control: socket.socket) -> None:
         if os.fork() == 0:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # whatever the server was started with
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the server's parent may have had it ignored
             _limit(*LIMITS.unpack(message))
             with contextlib.suppress(ConnectionError), socket.socket(fileno=descriptors[0]) as calls:
-                serve(calls)  # until the server closes the socket, which it does where a caller is gone
+                serve(calls)  # until the server closes the socket, as when a caller leaves
             os._exit(0)
         os.close(descriptors[0])
 
 
 def _limit(memory: int, nice: int) -> None:
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: whatever it is doing
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: ends with its parent
     os.nice(nice)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    # Not RLIMIT_AS, which counts the address space that libraries set aside and never use.
+    # RLIMIT_AS would also count address space that libraries reserve and never use.
     resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
 
 
 def serve(calls: socket.socket) -> None:
-    """Says its process id and resident memory, then answers calls (function, arguments) to the end.
+    """Sends its process id and resident memory, then answers calls (function, arguments) until the end.
 
     An answer is (value, None, resident memory [bytes]) or (None, error, resident memory).
     """
@@ -81,7 +81,7 @@ def serve(calls: socket.socket) -> None:
 
 def _call(call: bytes) -> tuple[Any, BaseException | None]:
     try:
-        name, arguments = pickle.loads(call)  # from the server; what strangers sent are bytes in it
+        name, arguments = pickle.loads(call)  # from the server; input of strangers is only bytes in it
         module, _, function = name.partition(":")
         return getattr(importlib.import_module(module), function)(*arguments), None
     except SpecshieldError as error:
@@ -103,7 +103,7 @@ def write(stream: Any, value: Any) -> None:
 
 
 def resident() -> int:
-    """The memory that this process holds [bytes], what it shares with the template left out."""
+    """The memory of this process without the part that it shares with the template [bytes]."""
     with open("/proc/self/statm") as file:
         _, total, shared, *_ = map(int, file.read().split())
     return (total - shared) * os.sysconf("SC_PAGE_SIZE")

@@ -1,4 +1,4 @@
-"""What a process for decisions does: the server's own functions, on shields that it has prepared itself."""
+"""The calls of a process for decisions: the server's own functions, with shields that it prepares itself."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _shields(settings: Settings) -> Shields:
 
 
 def step(settings: Settings, session: Session, request: StepBody) -> tuple[steps.Decided, float]:
-    """The step, and the seconds that it took."""
+    """The decided step, and the seconds that the decision took."""
     return steps.timed(_shields(settings), session, request)[:2]
 
 

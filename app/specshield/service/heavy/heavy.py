@@ -1,4 +1,4 @@
-"""The heavy work of one server process: uploads are read, and slow decisions are made, in other processes."""
+"""The heavy work of one server process: other processes read uploads, draw, and make slow decisions."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from specshield.service.heavy.pool import Pool, Template
 from specshield.service.problems import ClientGone, until_gone
 from specshield.service.settings import Settings
 
-# Chosen by hand: below what the server itself does (0), above what trains policies (`specshield worker`).
+# Niceness, chosen by hand: the server itself has 0, and the making of policies (`specshield worker`) 10 more.
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
-DECISION_TIMEOUT = 30.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels
-DECISION_MEMORY = 4 << 30  # [bytes]: tables of a few policies, and a look-ahead's
-IDLE = 60.0  # [s] after its last call that a child ends, and that the template ends if no child is left
+DECISION_TIMEOUT = 30.0  # [s]; the slowest known step takes 1 s, and the first one loads its kernels
+DECISION_MEMORY = 4 << 30  # [bytes]: for the tables of a few policies and of a look-ahead
+IDLE = 60.0  # [s] after the last call until a child ends, and until the template ends after the last child
 
 
 class Heavy:
-    """tasks: uploads and pictures. decisions: steps that take long."""
+    """tasks: the pool for uploads and pictures. decisions: the pool for slow decisions."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._template = settings, Template()
@@ -35,10 +35,10 @@ class Heavy:
         )
 
     async def run(self, request: Request, function: str, *arguments: Any) -> Any:
-        """What a function of heavy/uploads.py returns, or "pictures:function" of the module beside it. Its
-        first argument is the settings. See `Pool.run`.
+        """Calls a function of heavy/uploads.py, or of another module beside it as in "pictures:draw_policy",
+        with the settings as its first argument. See `Pool.run`.
 
-        Raises ClientGone, and ends the work, when the caller closes its connection.
+        If the caller closes the connection, this ends the work and raises ClientGone.
         """
         module, _, name = function.rpartition(":")
         asked = f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments
@@ -56,9 +56,9 @@ class Heavy:
             await asyncio.gather(work, gone, return_exceptions=True)
 
     async def decide(self, function: str, *arguments: Any, session: str, key: Hashable) -> Any:
-        """What a function of heavy/decisions.py returns. The sessions take turns.
+        """Calls a function of heavy/decisions.py with the settings first, when it is the session's turn.
 
-        key: of what the process has to prepare for it, such as the ids of the policies.
+        key: names what the process has to prepare, such as the policies: it is kept for further calls.
         """
         return await self.decisions.run(
             f"specshield.service.heavy.decisions:{function}",

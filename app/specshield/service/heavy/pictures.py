@@ -1,4 +1,4 @@
-"""What a child process draws, as SVG: the floor of a policy, and that of a session."""
+"""Draws the pictures of policies and sessions as SVG, in a child process."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from specshield.world.learned import LearnedMap, applied
 V = TypeVar("V")
 FORK = get_context("fork")
 # Chosen by hand. A start takes 0.4 ms with tables, and any time with a planner.
-HEADINGS = 4  # looked at from each place where places are no more than NEAR apart, else one
+HEADINGS = 4  # tried at each place if places are at most NEAR apart, else one
 FINEST, NEAR = 0.1, 1.0  # [m] between two places
-FINER = math.sqrt(2.0)  # from one grid to the next
-# Of `heavy_timeout`, 20 s by default: when no finer grid is begun any more, and when one is given up.
+FINER = math.sqrt(2.0)  # ratio of the distances of one grid of places and the next
+# Shares of `heavy_timeout` (20 s by default): when no finer grid is begun any more, and when one is given up.
 SOON, LATEST = 0.4, 0.7
 
 
 def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
-    """Map, regions, and from where the rule can still be kept at t = 0; and whether that is known, so that it
-    need not be drawn again. Raises NotFound, PolicyError.
+    """The map, the regions, and the starts from which the rule can be kept. Also whether these are known, so
+    that the picture need not be drawn again. Raises NotFound, PolicyError.
     """
     policies, began, most = policies_of(settings), time.monotonic(), LATEST * settings.heavy_timeout
     found = policies.find(key, owner)
     task = policies.task(found.about)
     plan = Plan(task, f"policy {found.name or found.id[:8]}: from where {task.formula} can be kept")
-    heat, said = None, "It is not ready yet: from where the rule can be kept is not known."
+    heat, said = None, "The policy is not ready yet, so the starts that can keep the rule are not known."
     if found.card is not None:
         shield = make_shield([policies.policy(found)])
         heats = kept_from(shield, began + SOON * settings.heavy_timeout)
         heat = latest(heats, began + most - time.monotonic())
-        said = f"From where the rule can be kept is not known: no start was decided within {most:g} s."
+        said = f"The starts that can keep the rule are not known: none was decided within {most:g} s."
     if heat is not None:
         share, pitch, headings = heat
         plan.heat(share)
@@ -66,9 +66,10 @@ def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
 def draw_session(
     settings: Settings, config: dict[str, Any], t: int, rows: Floats, last: bytes, known: LearnedMap
 ) -> bytes:
-    """Map, regions, the way driven on this map, and the certified continuation of the last decision.
+    """The map, the regions, the way driven on this map, and the certified continuation of the last decision.
 
-    last: the record of step t and of the last row, empty where that was not decided. known: of the map.
+    rows: the session's rows on this map. last: the record of step t, which is that of the last row, or b"".
+    known: what the session has learned of the map.
     """
     about = Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
     task = policies_of(settings).task(about)
@@ -86,44 +87,44 @@ def draw_session(
     dashed = "" if witness is None else "; dashed: the certified continuation"
     plan.line(f"{config['id']}, step {t}. The line is the way driven{dashed}.", "faint")
     if len(known):
-        plan.line("Violet is what it found occupied, faint what it found free: not so on the map.", "faint")
+        plan.line("Unlike the map: violet cells were found occupied, faint ones free.", "faint")
     plan.line(f"The rule's last step is {rules.origin(config) + task.horizon}.", "faint")
     return plan.svg()
 
 
 def latest(values: Iterator[V], seconds: float) -> V | None:
-    """The last of the values that come within so many seconds, however long each takes; None where none does.
+    """The last of the values that come within so many seconds, however long each takes; None if none comes.
 
-    They are made in a fork of this process, which the system ends then: a kernel that runs hears nothing. It
-    also ends when this process does. Raises MemoryError where it ends in another way.
+    A fork of this process makes them, and the system ends it after that time: a running kernel cannot be
+    interrupted in another way. It also ends with this process. Raises MemoryError if it ends otherwise.
     """
     reading, writing = FORK.Pipe(duplex=False)
 
     def send() -> None:
         follow_parent()
         reading.close()
-        signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))  # 0 would be none
+        signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))  # 0 would mean no timer
         for value in values:
             writing.send(value)
 
     process, found = FORK.Process(target=send), None
     process.start()
     writing.close()
-    with suppress(EOFError, OSError):  # its end, perhaps amid a value
+    with suppress(EOFError, OSError):  # the fork has ended, perhaps in the middle of a value
         while True:
             found = reading.recv()
     process.join()
     if process.exitcode not in (0, -signal.SIGALRM):
-        raise MemoryError(f"the fork ended with {process.exitcode}")  # most likely for want of it
+        raise MemoryError(f"the fork ended with {process.exitcode}")  # the most likely reason
     return found
 
 
 def kept_from(shield: Shield, deadline: float) -> Iterator[tuple[Floats, float, int]]:
-    """Of ever finer places, at first one for the whole map: the share of headings [rows, columns] from which
-    some first action has a future that keeps the rule, NaN where the robot does not fit, the first row at the
-    highest y; the places' pitch [m]; and how many headings were looked at from each.
+    """For ever finer grids of places, at first one place for the whole map: the share [rows, columns] of
+    headings from which the rule can be kept, NaN where the robot does not fit, the first row at the highest
+    y; the distance of two places [m]; and the number of headings tried at each place.
 
-    It ends where the next would likely come after the deadline [s, of time.monotonic].
+    It ends before a grid that would likely be finished after the deadline [s, of time.monotonic].
     """
     xmin, ymin, xmax, ymax = shield.task.grid.bounds
     wide, high = xmax - xmin, ymax - ymin
@@ -144,7 +145,7 @@ def kept_from(shield: Shield, deadline: float) -> Iterator[tuple[Floats, float, 
 
 
 def _kept(shield: Shield, x: float, y: float, theta: float) -> float:
-    """Whether an episode may begin there, as 1 or 0; NaN where the robot does not fit."""
+    """1 if an episode may begin there, else 0; NaN if the robot does not fit there."""
     try:
         return float(may_begin(shield, (x, y, theta)))
     except PoseError:

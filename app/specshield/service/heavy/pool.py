@@ -1,8 +1,8 @@
-"""A pool of child processes for calls that take long. One a server process.
+"""A pool of child processes for calls that take long.
 
-Nothing runs until the first call. Each call has a child to itself, a time limit, and the child a memory
-limit. A child is killed when its call takes too long or is cancelled, and one that keeps much memory after
-a call is let go, so that what an expensive request took comes back. Children that have nothing to do end.
+No process runs until the first call. Each call has a child of its own and a time limit, and the child has a
+memory limit. A child is killed when its call takes too long or is cancelled. A child that keeps much memory
+after a call ends, so that the memory of an expensive request is freed. Idle children end after a while.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from specshield.errors import ServerError, TooExpensive
 from specshield.service.heavy.child import LENGTH, LIMITS
 from specshield.service.heavy.queue import Turns
 
-# Chosen by hand; `python -m benchmarks.attacks` shows what they come to.
+# Chosen by hand; `python -m benchmarks.attacks` shows their effect.
 STARTS_WITHIN = 60  # [s] that a process may take to import everything on a busy machine
-MAY_GROW = 64 << 20  # [bytes] a child holds more than at its start when it is let go after a call
+MAY_GROW = 64 << 20  # [bytes] of additional memory after a call with which a child is not kept
 
 
 class Template:
-    """The process that children are forked from. It is started with the first of them."""
+    """The process from which children are forked. It is started with the first child."""
 
     def __init__(self) -> None:
         self._control: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
     def fork(self, memory: int, nice: int) -> socket.socket:
-        """The socket of a new child, which says its process id there first."""
+        """The socket of a new child, which first sends its process id and its memory there."""
         if self._process is None or self._process.poll() is not None:
             self.stop()
             self._control, theirs = socket.socketpair()
@@ -61,13 +61,13 @@ class Template:
             self._control = None
         if self._process is not None:
             self._process.kill()
-            self._process.wait()  # it has only just been killed
+            self._process.wait()  # takes no time after the kill
             self._process = None
 
 
 @dataclass(eq=False)
 class _Child:
-    """floor: the memory at its start [bytes]. key: of its last call. since: that call ended then [s]."""
+    """floor: the memory at its start [bytes]. key: of its last call. since: when that call ended [s]."""
 
     pid: int
     floor: int
@@ -84,8 +84,8 @@ class _Child:
         return await _read(self.reader)
 
     def kill(self) -> None:
-        """At once, unless it writes what it has claimed: then it ends when it finds its caller gone."""
-        if not self.reader.at_eof():  # it is there still, and the process id is its own
+        """Ends the child at once, or if it is writing what it has claimed, after that."""
+        if not self.reader.at_eof():  # the child still runs, so that the process id is its own
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGTERM)
         self.writer.close()
@@ -93,9 +93,9 @@ class _Child:
 
 @dataclass(eq=False)
 class Pool:
-    """size: children at once. memory [bytes]: the most that a child may take. waiting: calls of one owner
-    that may wait. idle [s]: a child without a call ends after as long. unused: called when the last child
-    has ended, with the time of the end of its last call. children: how many there are.
+    """size: the most children at once. memory: the most for one child [bytes]. waiting: the most waiting
+    calls of one owner. idle: how long a child without a call stays [s]. unused: called after the end of the
+    last child, with the time at which its last call ended. children: the number of children now.
     """
 
     template: Template
@@ -114,11 +114,11 @@ class Pool:
     async def run(
         self, function: str, *arguments: Any, seconds: float, owner: str = "", key: Hashable = None
     ) -> Any:
-        """What "module:function" returns in a child; a SpecshieldError that it raises is raised here.
+        """The result of "module:function" in a child. A SpecshieldError of the function is raised here.
 
-        seconds: of its running, not of its waiting. key: calls of one key go to one child where that is free,
-        for what the child has kept. Raises Busy where the owner has too many waiting, TooExpensive where it
-        takes more time or memory than it may. Cancelling this kills the child.
+        seconds: the time limit, without the time of waiting. key: calls with the same key go to the same
+        child if it is free, for what it has kept. Raises Busy if the owner has too many waiting calls,
+        TooExpensive for a call that takes too much time or memory. Cancelling this call kills the child.
         """
         await self._turns.take(owner)
         try:
@@ -152,13 +152,13 @@ class Pool:
         return value
 
     async def _child(self, key: Hashable) -> _Child:
-        """One that has nothing to do: the last to have worked for this key, else a new one, else any."""
-        for dead in [child for child in self._idle if child.reader.at_eof()]:  # for want of memory, say
+        """An idle child: the last one that worked for this key, else a new one, else any."""
+        for dead in [child for child in self._idle if child.reader.at_eof()]:  # as when memory ran out
             self._idle.remove(dead)
             self._let_go(dead)
         found = next((child for child in reversed(self._idle) if child.key == key), None)
         if found is None and self.children >= self.size:
-            found = self._idle[0]  # the longest idle; there is one, since this is the caller's turn
+            found = self._idle[0]  # the longest idle; there is one, since the caller has a turn
         if found is not None:
             self._idle.remove(found)
             return found
@@ -174,7 +174,7 @@ class Pool:
             return await self._fork()
         except (OSError, asyncio.IncompleteReadError) as error:
             self.template.stop()
-            if again:  # an old template may have died since the last child
+            if again:  # the template may have died since the last child
                 return await self._start(again=False)
             raise ServerError("a process for this does not start; the server's log says more") from error
 
@@ -196,7 +196,7 @@ class Pool:
             self.unused(child.since)
 
     def _sweep(self) -> None:
-        """Ends the children that have been idle for long, and looks again when the next will have been."""
+        """Ends the children that have been idle for too long, and sets a timer for the next one."""
         self._sweeping = None
         now = time.monotonic()
         while self._idle and self._idle[0].since + self.idle <= now + 0.01:

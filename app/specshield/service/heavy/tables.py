@@ -1,8 +1,8 @@
-"""Tables for the maps that sessions learn, made beside their decisions and used when they are there.
+"""Tables of policies for the maps that sessions learn. They are made in the background.
 
-Until then, and on what the map has learned since, the ways around are searched for (reachability/around/).
-Which tables a decision used is in its record, by the digest of the map that they were made for: so it can be
-decided again.
+Until a session's tables are ready, and for changes of its map since then, ways around are searched for
+(reachability/around/). A decision's record has the digest of the map that its tables were made for, so that
+the decision can be made again.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from specshield.world.learned import LearnedMap, applied
 from specshield.world.occupancy import OccupancyGrid
 
 log = logging.getLogger("specshield")
-ROOM = 64  # sessions whose tables are kept: about a megabyte each. Chosen by hand.
+ROOM = 64  # sessions whose tables are kept, about a megabyte each. Chosen by hand.
 
 
 class Made(NamedTuple):
-    """A shield's policies, with the tables for a session's own map.
-
-    digest: of what that map has learned. policies: their ids.
+    """The policies of a shield with tables for a session's own map. digest: of what was learned of the map.
+    policies: the policies' ids.
     """
 
     digest: bytes
@@ -37,8 +36,8 @@ class Made(NamedTuple):
 
 
 class Tables:
-    """The newest tables of each session. One thread makes them, a session's at a time; kernels run without
-    the interpreter's lock.
+    """The newest tables of each session. One thread makes them, for one session at a time; kernels run
+    without the interpreter's lock.
     """
 
     def __init__(self) -> None:
@@ -46,10 +45,10 @@ class Tables:
         self._newest, self._making = files.Recent[Made](ROOM), files.Recent[Future[Made]](ROOM)
 
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
-        """The shield with the newest tables that there are for the session, and their digest, None where
-        there are none. Those for `known` are begun, unless others of the session are being made.
+        """The shield with the newest tables of the session, and their digest, None if it has none yet. Also
+        begins to make the tables for `known`, unless others of the session are being made.
 
-        session: its nonce. Its id may be another owner's as well, and may be begun again.
+        session: its nonce, since its id may belong to other owners or to a later session too.
         """
         if not len(known) or not any(isinstance(each, ReachabilityPolicy) for each in shield.proposers):
             return shield, None
@@ -59,7 +58,7 @@ class Tables:
             self._newest.put(session, making.result())
             making = None
         newest = self._newest.peek(session)
-        if newest is not None and newest.policies != _ids(shield):  # of a rule that is no longer in force
+        if newest is not None and newest.policies != _ids(shield):  # they are of an earlier rule
             newest = None
         if making is None and (newest is None or newest.digest != known.digest):
             self._making.get(session, lambda: self._threads.submit(make, shield, known))
@@ -69,13 +68,13 @@ class Tables:
 
 
 def make(shield: Shield, known: LearnedMap) -> Made:
-    """Makes them: seconds of work, the same wherever it is done."""
+    """Makes the tables, which takes seconds. The result is the same on every machine."""
     grid = applied(shield.task.grid, known)
     return Made(known.digest, _ids(shield), tuple(_remade(each, grid) for each in shield.proposers))
 
 
 def _remade(proposer: Proposer, grid: OccupancyGrid) -> Proposer:
-    """The policy itself where it has no tables, or none can be made for this map."""
+    """The policy with tables for this map, or unchanged if it has none or they cannot be made."""
     if not isinstance(proposer, ReachabilityPolicy):
         return proposer
     try:

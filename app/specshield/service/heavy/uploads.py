@@ -1,6 +1,6 @@
-"""What a child process does with an upload, or draws. Nothing of it is read in the server.
+"""Reads what callers upload, mostly in a child process: the server itself reads only short formulas.
 
-Every function takes the settings first, and gives what the server needs for its answer.
+The functions that a child runs take the settings first, and return what the server needs for its answer.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ from specshield.world.formats import read_map
 
 M = TypeVar("M", bound=BaseModel)
 Content = bytes | Path  # a body, or the file that it is in
-FILES = "map_server"  # the format of a map sent as files that do not say which it is
+FILES = "map_server"  # the format of maps that are sent as files without a `format`
 PARTS = {"weights": "policy.safetensors", "card": "card.json"}
 MOST_PARTS = 16  # of a multipart body
-MOST_WINDOWS = 100  # shown of a formula
+MOST_WINDOWS = 100  # of a formula that the answer shows
 
 
 @cache
@@ -61,8 +61,8 @@ def _maps(settings: Settings) -> Maps:
 
 
 class _Finishing(Claims):
-    """What is claimed is written, or given back, though `Pool` tells this process to end meanwhile: nobody
-    would find a claim without its files, and it would count for good.
+    """Claims whose files are written, or which are given back, even if `Pool` ends this process meanwhile: a
+    claim without files would count for ever.
     """
 
     @contextmanager
@@ -89,7 +89,7 @@ def add_map(settings: Settings, content_type: str, content: Content, key: Key) -
 
 
 def _named(name: Any) -> str | None:
-    """The name that an upload asks for. Raises InputError for one that cannot be an id."""
+    """The name in an upload. Raises InputError unless it has the form of an id."""
     if name is not None and not (isinstance(name, str) and re.fullmatch(ID, name)):
         raise InputError("this is no name", path="name", got=name, expected=ID_TOLD)
     return name
@@ -129,7 +129,7 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
 
 
 def check_policy(settings: Settings, content: Content, owner: str) -> tuple[Record, str | None]:
-    """What is asked for, once it is checked, and what it is to be called; nothing is kept."""
+    """Checks a request for a policy. Returns the policy that it describes, and its name; keeps nothing."""
     asked = parse(PolicyRequest, _bytes(content))
     body = asked.model_dump(exclude_unset=True)
     method = METHODS.get(asked.method)
@@ -154,7 +154,7 @@ def check_spec(settings: Settings, content: bytes, owner: str) -> dict[str, Any]
 
 
 def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[str, Any]:
-    """What a formula means, as the contract shows it."""
+    """Checks a formula, and returns the answer of /v1/specs/validate."""
     request = parse(SpecRequest, content)
     body = request.model_dump()
     regions = parse_regions(body["regions"] or {})
@@ -189,7 +189,7 @@ def is_multipart(content_type: str) -> bool:
 
 
 def _parts(content_type: str, content: Content) -> dict[str, bytes]:
-    """The parts of a multipart body by name. Raises InputError where two have one name."""
+    """The parts of a multipart body by name. Raises InputError, also if two parts have the same name."""
     found: list[tuple[str, bytes]] = []
 
     def note(part: Any) -> None:
@@ -233,8 +233,8 @@ def _object(content: bytes) -> dict[str, Any]:
 
 
 def parse(model: type[M], content: bytes, below: str = "") -> M:
-    """`content` as JSON of this shape. Raises InputError, its path below `below`."""
-    content = content.removeprefix(codecs.BOM_UTF8)  # that some editors and shells write
+    """`content` as a JSON object of this model. below: the field that it is. Raises InputError."""
+    content = content.removeprefix(codecs.BOM_UTF8)  # some editors and shells write one
     try:
         return model.model_validate_json(content)
     except ValidationError as invalid:

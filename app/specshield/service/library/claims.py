@@ -1,9 +1,9 @@
-"""Whose the maps and policies are, and what they take of the disk. All but `Claims.settled` is blocking.
+"""The owners' claims on maps and policies, and the bytes that these take. All but `Claims.settled` blocks.
 
-Content is kept once, under its hash; each owner that sent or asked for it has a claim on it, and it goes with
-the last one. One script decides every change (claims.lua), so that of a deletion and of a creation that needs
-what is deleted only one succeeds, whichever servers they came to: a deletion marks first, looks for users,
-then takes the claim; whoever uses a policy looks at the mark after its use can be seen (`Claims.settled`).
+Content is kept once, under its hash. Each owner that sent it or asked for it has a claim on it; it is removed
+with the last claim. One script makes every change (claims.lua). So of a deletion and of a creation that needs
+what is deleted only one succeeds, whichever servers they came to: a deletion sets a mark, looks for users,
+and then takes the claim; a session is stored first, and then its policies are looked at (`Claims.settled`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from specshield.service.settings import Settings
 from specshield.service.storage.connect import reaching
 
 SCRIPT = Path(__file__).with_name("claims.lua").read_text()
-PATIENCE = 5.0  # [s] to wait for a deletion of the same id; one takes milliseconds. Chosen by hand
-WAIT = 0.02  # [s] between two looks at it
+PATIENCE = 5.0  # [s] to wait for a deletion of the same id, which takes milliseconds. Chosen by hand.
+WAIT = 0.02  # [s] between two looks whether the deletion has ended
 
 
 class Claims:
-    """kind: "maps" or "policies". Every method raises StoreError where the store cannot be reached."""
+    """kind: "maps" or "policies". Every method raises StoreError if the store cannot be reached."""
 
     def __init__(self, connected: Callable[[], Any], settings: Settings) -> None:
-        """connected: gives a blocking connection of redis. It is first asked when a claim is: the store may
-        be away before.
+        """connected: returns a blocking client of the store. It is called when a claim is needed, since the
+        store may be away before.
         """
         self._store, self._settings = connected, settings
 
@@ -43,8 +43,8 @@ class Claims:
         return bool(reached(lambda: self._store().hexists(_key(kind, owner), id)))
 
     async def settled(self, kind: str, id: str, owner: str) -> bool:
-        """Whether the owner holds it, once no deletion of it is under way. No thread waits: many callers
-        would hold those that the deletion needs.
+        """Whether the owner has a claim, once no deletion of the thing is under way. This waits without a
+        thread: many waiting callers would take the threads that the deletion needs.
         """
         deadline, key = time.monotonic() + PATIENCE, _key("mark", kind, id)
         while await asyncio.to_thread(reached, lambda: self._store().exists(key)):
@@ -54,7 +54,7 @@ class Claims:
         return await asyncio.to_thread(self.holds, kind, id, owner)
 
     def named(self, kind: str, name: str, owner: str) -> str | None:
-        """The id of what this owner calls by that name."""
+        """The id of the owner's map or policy of this name."""
         return self._text(_key("names", kind, owner), name)
 
     def name_of(self, kind: str, id: str, owner: str) -> str | None:
@@ -65,24 +65,24 @@ class Claims:
         return None if found is None else str(found.decode())
 
     def names(self, kind: str, owner: str) -> dict[str, str]:
-        """{id: name} of everything that this owner has named."""
+        """{id: name} of everything to which this owner gave a name."""
         found = reached(lambda: self._store().hgetall(_key("named", kind, owner)))
         return {id.decode(): name.decode() for id, name in found.items()}
 
     def name(self, kind: str, id: str, owner: str, name: str) -> None:
-        """Names what an owner has; a former name of it is free again. Raises NameTaken and NotFound."""
+        """Gives a name to a thing of an owner; its former name becomes free. Raises NameTaken, NotFound."""
         said = self._run("name", kind, id, owner, "", name)
         if said == "none":
-            raise NotFound(f"there is no {id!r} to name", path="name", got=name)
+            raise NotFound(f"there is no {id!r} to which a name can be given", path="name", got=name)
         if said != "named":
             raise taken(name, said)
 
     @contextmanager
     def adding(self, kind: str, id: str, key: Key, size: int, map_id: str = "") -> Iterator[None]:
-        """Around the writing of `size` bytes: room is taken before, and given back where writing fails.
+        """Claims `size` bytes before the block writes them, and gives them back if the block fails.
 
-        map_id: of a policy on a map that is not everybody's. Raises LimitReached and
-        InsufficientStorage, Conflict where a deletion goes on for long, and NotFound for a map that is gone.
+        map_id: for a policy, its map, "" if that is everybody's. Raises LimitReached and InsufficientStorage,
+        Conflict if a deletion goes on for long, and NotFound for a map that was deleted.
         """
         settings = self._settings
         files.check_free(settings.data_dir, settings.disk_reserve_bytes + size)
@@ -115,38 +115,37 @@ class Claims:
             raise
 
     def mark(self, kind: str, id: str, owner: str, token: str) -> str | None:
-        """Begins a deletion: from now on nobody begins to use it. The policy that uses a map, if one does."""
+        """Begins a deletion, from which on no use of the thing begins. Returns a policy that uses the map."""
         said = self._patiently("mark", kind, id, owner, token)
         if said == "none":
             raise missing(kind, id, "an id")
         return None if said == "marked" else said
 
     def free(self, kind: str, id: str, owner: str, token: str, map_id: str = "") -> bool:
-        """Takes an owner's claim. True where it was the last one: the files have to go, then `unmark`."""
+        """Takes an owner's claim. True if it was the last one: then remove the files and call `unmark`."""
         said = self._run("free", kind, id, owner, token, map_id=map_id)
         if said == "lost":
-            raise Conflict("the deletion took too long", path="id", got=id, expected="to be asked for again")
+            raise Conflict("the deletion took too long", path="id", got=id, expected="the request again")
         return said == "last"
 
     def unmark(self, kind: str, id: str, token: str) -> None:
         self._run("unmark", kind, id, "", token)
 
     def weigh(self, kind: str, id: str, size: int) -> None:
-        """Notes what was written after the claim was made."""
+        """Notes how many bytes a thing has, as more was written after the claim."""
         for owner in reached(lambda: self._store().smembers(_key("owners", kind, id))):
             self._run("weigh", kind, id, owner.decode(), "", size)
 
     def owners(self, kind: str, id: str) -> int:
-        """How many hold it."""
+        """How many owners have a claim."""
         return int(reached(lambda: self._store().scard(_key("owners", kind, id))))
 
     def _patiently(self, what: str, *args: Any) -> str:
-        """Waits while another deletes the same thing. Raises Conflict where that takes long."""
+        """Runs the script once no deletion of the same thing is under way. Raises Conflict after PATIENCE."""
         deadline = time.monotonic() + PATIENCE
         while (said := self._run(what, *args)) == "busy":
             if time.monotonic() > deadline:
-                expected = "to be asked for again"
-                raise Conflict("it is being deleted", path="id", got=args[1], expected=expected)
+                raise Conflict("it is being deleted", path="id", got=args[1], expected="the request again")
             time.sleep(WAIT)
         return said
 
@@ -164,16 +163,14 @@ class Claims:
 
 
 class Claimed:
-    """What maps and policies share. claims: whose they are; needed to find, add and delete."""
+    """What maps and policies share. claims: None where nothing is found by owner, added or deleted."""
 
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
         self._kind, self.given, self._kept = kind, claims, files.Kept(settings, kind)
         self._named: Mapping[str, Any] = {}  # what came with the server
 
     def check_name(self, name: str, id: str, owner: str) -> None:
-        """Raises NameTaken where something else than `id` has the name, and InputError for one that nothing
-        can have.
-        """
+        """Raises NameTaken if something else than `id` has the name, InputError if nothing may have it."""
         shipped = {each: known.id for each, known in self._named.items()}
         if files.HASH.fullmatch(name):
             raise InputError("this is the form of an id", path="name", got=name, expected="another name")
@@ -191,7 +188,7 @@ class Claimed:
         return self.given
 
     def _id_of(self, key: str, owner: str) -> str:
-        """The id of what an owner calls `key`; `key` itself where that is no name of theirs."""
+        """The id of the owner's thing of this name; `key` itself if it is no name."""
         return key if files.HASH.fullmatch(key) else self.claims.named(self._kind, key, owner) or key
 
 
@@ -210,6 +207,6 @@ def taken(name: str, id: str) -> NameTaken:
 
 
 def reached(action: Callable[[], Any]) -> Any:
-    """What a question to the store gives. Raises StoreError where it cannot be reached."""
+    """The result of an action on the store. Raises StoreError if the store cannot be reached."""
     with reaching():
         return action()

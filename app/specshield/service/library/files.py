@@ -1,4 +1,4 @@
-"""The files of maps and policies, which all servers of a store share: each under the hash of its content."""
+"""The files of maps and policies, which all servers of a store share, under the hashes of their content."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from specshield.service.storage.objects import Folder, open_objects, unusable
 
 MARK = {"maps": "map.json", "policies": "policy.json"}
 HASH = re.compile(r"[0-9a-f]{64}")
-PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
-BEHIND_A_URL = 4 << 10  # [bytes] as which a page counts what is there, whose size would take long to ask
+PAGE_BYTES = 256 << 10  # of items on a page of a list; chosen by hand: read and shown in a few ms
+BEHIND_A_URL = 4 << 10  # [bytes] for which an item at a URL counts on a page: its size would take long to ask
 V = TypeVar("V")
 
 
 class Kept:
-    """All `maps`, or all `policies`: a folder each, of files that never change once they are there. The mark
-    is written last and removed first: it says that a folder is there at all.
+    """The files of all `maps`, or of all `policies`: a folder for each, whose files never change. One file,
+    the mark, is written last and removed first: a folder without it does not count.
 
-    Methods raise StoreError where the files cannot be reached, and InsufficientStorage for a full disk.
-    root: the folder on a disk of this machine; that of its copies where the files are behind a URL.
+    Methods raise StoreError if the files cannot be reached, and InsufficientStorage for a full disk.
+    root: the folder on a disk of this machine, with copies if the files are at a URL.
     """
 
     def __init__(self, settings: Settings, kind: str) -> None:
@@ -40,14 +40,14 @@ class Kept:
         self._mark, self.root = MARK[kind], self._here.root
 
     def find(self, id: str, name: str) -> Any:
-        """What a file of JSON holds; None where it is not there, or no more."""
+        """The content of a JSON file; None if there is no such file."""
         content = self._objects.read(f"{id}/{name}")
         if content is None and name == self._mark and self._copies:
             shutil.rmtree(self.root / id, ignore_errors=True)  # another server has removed it
         return None if content is None else json.loads(content)
 
     def file(self, id: str, name: str) -> Path:
-        """A file on a disk of this machine: it itself, or a copy that is made now."""
+        """The path of a file on a disk of this machine: the file itself, or a copy that is made now."""
         path = self.root / id / name
         if self._copies and not path.exists():
             content = self._objects.read(f"{id}/{name}")
@@ -56,28 +56,28 @@ class Kept:
         return path
 
     def size(self, id: str, *names: str) -> int:
-        """About as many bytes as reading these files takes."""
+        """About how many bytes these files have."""
         return BEHIND_A_URL if self._copies else sum(size(self.root / id / name) for name in names)
 
     def write(self, id: str, files: Mapping[str, bytes]) -> None:
-        # Weights before the card that makes them count.
+        # Weights are written before the card, which makes them count.
         for name in sorted(files, key=lambda name: (name == self._mark, name.endswith(".json"), name)):
             self._objects.write(f"{id}/{name}", files[name])
 
     def remove(self, id: str) -> None:
         self._objects.remove(f"{id}/{self._mark}")
-        shutil.rmtree(self.root / id, ignore_errors=True)  # with what a training has left there
+        shutil.rmtree(self.root / id, ignore_errors=True)  # with the checkpoints of a training
         for name in self._objects.names(id):
             self._objects.remove(f"{id}/{name}")
 
     def weight(self, id: str) -> int:
-        """Bytes that the files take; 0 where there are none."""
+        """The bytes of all files of a thing; 0 if it has none."""
         return sum(size for path, size in self._objects.sizes(id) if path.count("/") == 1)
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Makes the folder if need be. Raises InputError, with its setting's name, where it takes no files or
-    cannot be listed.
+    """Makes the folder if it does not exist. Raises InputError with the setting `name` if no file can be
+    written there, or the folder cannot be listed.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -93,13 +93,13 @@ def to_json(value: Any) -> bytes:
 
 
 def check_free(folder: Path, wanted: int) -> None:
-    """Raises InsufficientStorage where the disk of `folder` has fewer free bytes. One system call."""
+    """Raises InsufficientStorage if the disk of `folder` has fewer free bytes. Takes one system call."""
     try:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         raise unusable(error) from error
     if free < wanted:
-        expected = f"at least {wanted} bytes free: delete something"
+        expected = f"at least {wanted} free bytes: delete something"
         raise InsufficientStorage("the server's disk is full", got=free, expected=expected)
 
 
@@ -108,7 +108,7 @@ def page(
 ) -> tuple[list[str], str | None]:
     """The first `limit` keys after `after`, in order, and the `after` of the next page, None on the last.
 
-    size: about as many bytes as reading a key's item takes; no page takes many more than `PAGE_BYTES`.
+    size: about how many bytes the item of a key has; a page has at most about `PAGE_BYTES` of them.
     """
     rest = sorted(key for key in keys if after is None or key > after)
     taken, room = 0, PAGE_BYTES
@@ -119,7 +119,7 @@ def page(
 
 
 def size(path: Path) -> int:
-    """Bytes; 0 where there is no such file."""
+    """The bytes of a file; 0 if there is no such file."""
     try:
         return path.stat().st_size
     except OSError:
@@ -136,8 +136,8 @@ def rfc3339(seconds: float) -> str:
 
 
 class Recent(Generic[V]):
-    """Keeps the values that were used last: `room` of them, or with `size` those that come to `room`. Threads
-    may share it; two of them may make one value at once.
+    """Keeps the values that were used last, as long as their sizes add up to at most `room`; by default each
+    has size 1. Threads may share it; two of them may make the same value at the same time.
     """
 
     def __init__(self, room: int, size: Callable[[V], int] = lambda value: 1) -> None:
@@ -152,7 +152,7 @@ class Recent(Generic[V]):
         return found
 
     def peek(self, key: Hashable) -> V | None:
-        """The value, if it is kept. Asking counts as a use of it."""
+        """The value, if it is kept. This counts as a use of it."""
         with self._lock:
             if key not in self._values:
                 return None

@@ -1,7 +1,7 @@
-"""The maps a server has: those of `maps/`, under their names, and those sent, in `<data>/maps/<id>/`.
+"""The maps of a server: those in `maps/`, which have names, and those that were sent, in `<data>/maps/<id>/`.
 
-A folder holds `map.yaml` and `map.png`, as map_server has them, one bit a cell (older ones a `map.pgm`), and
-`map.json`: what is shown of the map.
+Such a folder has `map.yaml` and `map.png`, in map_server's form with one bit for each cell (older folders
+have `map.pgm`), and `map.json`: the map as the contract shows it.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ class Map:
         }
 
     def png(self) -> bytes:
-        """Black is occupied; row 0 of the image is the map's highest y. One bit a cell, compressed."""
+        """The cells as an image: black is occupied, and row 0 of the image is the map's highest y."""
         buffer = io.BytesIO()
         Image.fromarray(~self.grid.occupied[::-1]).save(buffer, "PNG")
         return buffer.getvalue()
 
 
 class Maps(Claimed):
-    """The calls block: they read and write files."""
+    """All calls block: they read and write files."""
 
     def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
         super().__init__("maps", claims, settings)
@@ -69,7 +69,7 @@ class Maps(Claimed):
         self._named: Mapping[str, Map] = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
     def get(self, key: str) -> Map:
-        """By id, or one that came with the server, whoever asks. Raises NotFound."""
+        """A map by its id, whoever owns it, or one that came with the server. Raises NotFound."""
         found = self.shipped(key)
         if found is not None:
             return found
@@ -77,15 +77,15 @@ class Maps(Claimed):
         return self._recent.get(key, lambda: self._read(key, stored))
 
     def shipped(self, key: str) -> Map | None:
-        """One that came with the server, by its id, its name, or the hash of its grid."""
+        """A map that came with the server, by its id, its name, or the hash of its grid."""
         for found in self._named.values():
             if key in (found.name, found.id, found.grid.content_hash):
                 return found
         return None
 
     def find(self, key: str, owner: str) -> Map:
-        """One that this owner may see: by id or name, or by the hash of the grid alone, which is what a
-        policy's card knows. Raises NotFound.
+        """A map that this owner may use, by its id, its name, or the hash of its grid alone, which policies'
+        cards have. Raises NotFound.
         """
         found = self.shipped(key)
         if found is not None:
@@ -101,7 +101,7 @@ class Maps(Claimed):
         raise missing("maps", key)
 
     def show(self, key: str, owner: str) -> dict[str, Any]:
-        """The map as JSON, which can be had without reading the cells. Raises NotFound."""
+        """A map as the contract shows it, mostly without reading its cells. Raises NotFound."""
         if self.shipped(key) is not None:
             return self.find(key, owner).to_json()
         id = self._id_of(key, owner)
@@ -109,8 +109,8 @@ class Maps(Claimed):
         return {**shown, "name": self.claims.name_of("maps", shown["id"], owner)}
 
     def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key, name: str | None = None) -> Map:
-        """Keeps a map for an owner, its content once, under a name if one is given. Raises MapError for rooms
-        that no formula could name, LimitReached, InsufficientStorage and NameTaken.
+        """Keeps a map for the owner of the key, under a name if one is given. Raises MapError for rooms whose
+        names no formula could use, LimitReached, InsufficientStorage and NameTaken.
         """
         parse_regions(rooms, "rooms")
         id = _id(grid, rooms)
@@ -137,7 +137,7 @@ class Maps(Claimed):
         return replace(kept, name=self.claims.name_of("maps", id, key.name))
 
     def delete(self, key: str, owner: str) -> None:
-        """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
+        """Removes a map for an owner, and its files with the last one. Raises NotFound, InUse, Conflict."""
         found = self.shipped(key)
         if found is not None:
             raise undeletable("map", found.name, key)
@@ -159,7 +159,7 @@ class Maps(Claimed):
             self.claims.unmark("maps", key, token)
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
-        """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
+        """One page of the maps that an owner may use, as the contract shows them, without reading cells."""
         keys = [*self._named, *self.claims.ids("maps", owner)]
         keys, following = files.page(keys, after, limit, lambda key: self._kept.size(key, "map.json"))
         names, shown = self.claims.names("maps", owner), []
@@ -175,7 +175,7 @@ class Maps(Claimed):
         return shown
 
     def _stored(self, id: str) -> dict[str, Any]:
-        """What a map's map.json holds. Raises NotFound where there is none, or no more."""
+        """The content of a map's map.json. Raises NotFound if there is none."""
         found: dict[str, Any] | None = self._kept.find(id, "map.json") if files.HASH.fullmatch(id) else None
         if found is None:
             raise missing("maps", id)
@@ -192,7 +192,7 @@ class Maps(Claimed):
 
 
 def undeletable(what: str, name: str | None, key: str) -> InUse:
-    """The error for a `what`, "map" or "policy", that came with the server and is to be deleted."""
+    """The error for deleting a map or policy (`what`) that came with the server."""
     message, expected = f"{what} {name!r} came with the server and cannot be deleted", f"a {what} of your own"
     return InUse(message, path=f"{what}_id", got=key, expected=expected)
 
@@ -209,7 +209,7 @@ def _shipped(folder: Path) -> Iterator[Map]:
 
 
 def _id(grid: OccupancyGrid, rooms: Mapping[str, Region]) -> str:
-    """The hash of what a map holds: the grid's own where no area has a name."""
+    """The hash of a map's grid and of its named areas; without these it is the hash of the grid."""
     if not rooms:
         return grid.content_hash
     content = grid.content_hash.encode() + files.to_json(dict(sorted(_rooms_json(rooms).items())))

@@ -1,6 +1,7 @@
-"""The policies a server has: those of `models/`, under their names, and those in `<data>/policies/<id>/`.
+"""The policies of a server: those in `models/`, which have names, and those in `<data>/policies/<id>/`.
 
-A folder holds `policy.json` (what it is of), and once trained `policy.safetensors` and, last, `card.json`.
+Such a folder has `policy.json` (the policy's description) and, once it is made, `policy.safetensors` and then
+`card.json`.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64
-AT_ONCE = 16  # policies that a list reads
-SMALL = "policy.json", "card.json"  # of the files of a policy, all that a list shows
+AT_ONCE = 16  # policies that are read at the same time for a list
+SMALL = "policy.json", "card.json"  # the files of a policy that a list needs
 WEIGHTS = "policy.safetensors"
 log = logging.getLogger("specshield")
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a policy is for and how it is made: enough to make its task and to train it. All of it is JSON."""
+    """The task of a policy, and how the policy is made. All of it is JSON."""
 
     map_id: str
     robot: str | dict[str, Any]
@@ -48,7 +49,7 @@ class Description:
 
 @dataclass(frozen=True)
 class Record:
-    """A policy that is known here. card: None until it is made."""
+    """A policy of this server. card: None until the policy is made."""
 
     id: str
     about: Description
@@ -59,7 +60,7 @@ class Record:
 
 
 class Policies(Claimed):
-    """The calls block on files. A key is an id, or the name of a policy that came with the server."""
+    """All calls but `still_there` block: they read and write files."""
 
     def __init__(self, settings: Settings, maps: Maps) -> None:
         super().__init__("policies", maps.given, settings)
@@ -69,7 +70,7 @@ class Policies(Claimed):
         self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
-        """By id, or one that came with the server, whoever asks. Raises NotFound."""
+        """A policy by its id, whoever owns it, or one that came with the server. Raises NotFound."""
         for found in self._named.values():
             if key in (found.name, found.id):
                 return found
@@ -80,21 +81,21 @@ class Policies(Claimed):
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
 
     def find(self, key: str, owner: str) -> Record:
-        """One that this owner may see. Raises NotFound."""
+        """A policy that this owner may use, by its id or its name. Raises NotFound."""
         found = self.record(key if key in self._named else self._id_of(key, owner))
         if found.name is None and not self.claims.holds("policies", found.id, owner):
             raise missing("policies", key)
         return found
 
     async def still_there(self, ids: Sequence[str], owner: str) -> None:
-        """Raises NotFound where a policy is gone: asked once whoever deletes it can see that it is used."""
+        """Raises NotFound if a policy was deleted. To be called once a deletion can see that it is used."""
         shipped = {record.id for record in self._named.values()}
         for id in ids:
             if id not in shipped and not await self.claims.settled("policies", id, owner):
                 raise missing("policies", id)
 
     def task(self, about: Description) -> Task:
-        """Raises NotFound for the map, RobotError, and what `make_task` raises."""
+        """The task of a policy. Raises NotFound for the map, RobotError, and what `make_task` raises."""
         world = self._maps.get(about.map_id)
         try:
             robot = robot_from_json(about.robot)
@@ -112,7 +113,7 @@ class Policies(Claimed):
             raise error.at("spec") from None
 
     def policy(self, record: Record) -> Proposer:
-        """The trained policy. Raises PolicyError where it is not ready."""
+        """The policy itself, loaded. Raises PolicyError if it is not ready."""
         return self._recent.get(record.id, lambda: self._load(record))
 
     def _load(self, record: Record) -> Proposer:
@@ -125,12 +126,12 @@ class Policies(Claimed):
         return load_policy(self._kept.file(record.id, WEIGHTS), record.card, task)
 
     def resolve(self, about: Description, owner: str) -> Description:
-        """The same with the map's id, whatever it was called. Raises NotFound."""
+        """The same description with the map's id in place of its name. Raises NotFound."""
         return replace(about, map_id=self._maps.find(about.map_id, owner).id)
 
     def described(self, about: Description, task: Task) -> Record:
-        """The policy of this description, whether there is one or not. Its spec is left with the regions and
-        signals that the formula names: it goes into every session. Raises InputError where that is too large.
+        """The record for this description, whether the policy exists or not. Its spec, which every session
+        stores, keeps only what the formula names. Raises InputError if that is too large.
         """
         spec = dict(about.spec)
         for kind, used in (("regions", task.regions), ("signals", task.signals)):
@@ -139,13 +140,13 @@ class Policies(Claimed):
         size = len(files.to_json(spec))
         if size > self._max_spec:
             told = "the spec is too large"
-            expected = f"at most {self._max_spec}, regions that the formula does not name left out"
+            expected = f"at most {self._max_spec} bytes, without the regions that the formula does not name"
             raise InputError(told, path="spec", got=f"{size} bytes as JSON", expected=expected)
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
 
     def name(self, record: Record, owner: str, name: str) -> None:
-        """Names an owner's policy. Raises NameTaken."""
+        """Gives a name to an owner's policy. Raises NameTaken."""
         if record.name is None:
             self.claims.name("policies", record.id, owner, name)
 
@@ -153,7 +154,7 @@ class Policies(Claimed):
         return record.name or self.claims.name_of("policies", record.id, owner)
 
     def made_here(self, id: str) -> Record | None:
-        """The policy of this id, if anybody asked for it."""
+        """The policy of this id, if there is one."""
         try:
             return self.record(id)
         except NotFound:
@@ -162,8 +163,8 @@ class Policies(Claimed):
     def add_card(
         self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
     ) -> Record:
-        """Keeps a policy that was made elsewhere, once all of it is checked. Its id covers all that was sent,
-        so that it cannot take the place of another one, or of one that is made here. Raises PolicyError.
+        """Checks a policy that was made elsewhere, and keeps it. Its id is a hash of all that was sent, so
+        that it never replaces another policy or one that is made here. Raises PolicyError.
         """
         try:
             about = self.resolve(about, key.name)
@@ -175,7 +176,7 @@ class Policies(Claimed):
         record = self.described(about, task)
         card = {**card, "spec": record.about.spec}
         id = self._on_map(sent_id(_id(about, task), card, weights), about, task)
-        card["id"] = id  # never the sender's
+        card["id"] = id  # instead of the sender's
         load_policy(weights, card, task)
         _check_options(about)
         record = replace(record, id=id, card=card)
@@ -187,8 +188,8 @@ class Policies(Claimed):
         return added
 
     def add(self, record: Record, key: Key, trained: Mapping[str, bytes] | None = None) -> Record:
-        """Notes a policy, unless there is one already. trained: its files, where it is not still to be made.
-        Raises LimitReached, InsufficientStorage.
+        """Keeps a policy for the owner of the key. trained: its files, if it is made already. Raises
+        LimitReached and InsufficientStorage.
         """
         if record.id in (found.id for found in self._named.values()):
             return self.record(record.id)
@@ -203,12 +204,13 @@ class Policies(Claimed):
         return self.record(record.id)
 
     def _own_map(self, about: Description) -> str:
-        """The id of a policy's map; "" where that is everybody's."""
+        """The id of a policy's map; "" if that came with the server."""
         return "" if self._maps.shipped(about.map_id) is not None else about.map_id
 
     def _on_map(self, id: str, about: Description, task: Task) -> str:
-        """The id of a policy on this map. `id` is the same for every map of these cells, whatever its rooms:
-        it stays on everybody's map, on one without rooms, and on that for which an older version kept it.
+        """The id of a policy on this map. `id` is the same for all maps with these cells, whatever their
+        rooms. It is kept for a map that came with the server, for one without rooms, and for the map for
+        which an older version kept the policy; for other maps it is another hash.
         """
         kept = self.made_here(id)
         if kept is None:
@@ -218,7 +220,7 @@ class Policies(Claimed):
         return id if stays else hashlib.sha256(f"{id} {about.map_id}".encode()).hexdigest()
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
-        """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
+        """Writes a policy that a run has made, the card last: it makes the policy ready. Raises NotFound."""
         if self._kept.find(id, "policy.json") is None:
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
         self._kept.write(id, {WEIGHTS: weights, "card.json": files.to_json({**card, "id": id})})
@@ -229,8 +231,8 @@ class Policies(Claimed):
         return self._kept.root / id / "checkpoint"
 
     def delete(self, record: Record, owner: str, token: str) -> bool:
-        """Takes the claim of an owner who has marked the deletion by this token. True where the policy went
-        with it. Raises Conflict where the marking is too long ago.
+        """Takes the claim of an owner whose deletion was marked with this token. True if the policy was
+        removed with it. Raises Conflict if the mark has expired.
         """
         last = self.claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
@@ -239,11 +241,11 @@ class Policies(Claimed):
         return last
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
-        """One page of an owner's policies and those of all."""
+        """One page of the policies that an owner may use."""
         keys = [*self._named, *self.claims.ids("policies", owner)]
         keys, following = files.page(keys, after, limit, lambda key: self._kept.size(key, *SMALL))
-        with ThreadPoolExecutor(AT_ONCE) as pool:  # those behind a URL take long
-            found = list(pool.map(self.made_here, keys))  # None: not written to the end, or deleted by now
+        with ThreadPoolExecutor(AT_ONCE) as pool:  # policies at a URL take long to read
+            found = list(pool.map(self.made_here, keys))  # None: not completely written, or deleted by now
         return [record for record in found if record is not None], following
 
     def _shipped(self) -> Iterator[Record]:
@@ -264,8 +266,8 @@ def describe(card: Mapping[str, Any]) -> Description:
 
 
 def _check_options(about: Description) -> None:
-    """Raises PolicyError for a value that no option of the method takes. An older version may have had
-    other options.
+    """Raises PolicyError for a wrong value of an option. Unknown options are left out: an older version may
+    have had them.
     """
     cls = METHODS.get(about.method).options
     known = {each.name for each in fields(cls)}
@@ -276,8 +278,8 @@ def _check_options(about: Description) -> None:
 
 
 def sent_id(made_here: str, card: Mapping[str, Any], weights: bytes) -> str:
-    """The id of a policy that was made elsewhere: sha256 over the id of the one that would be made here, the
-    rest of the card, and the weights, as hex. That of one that is made here is over other members.
+    """The id of a policy that was made elsewhere: SHA-256, in hex, over the id that it would have if it were
+    made here, the rest of the card, and the weights. Ids of policies that are made here hash other members.
     """
     content = {
         "made_of": made_here,
