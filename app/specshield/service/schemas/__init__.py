@@ -1,1 +1,1 @@
-"""What the HTTP contract takes and gives."""
+"""The requests and answers of the HTTP contract."""

@@ -1,4 +1,4 @@
-"""The answer to a step as it is written, which is what `steps.StepResponse` describes."""
+"""The answer to a step in the form that is fast to write. `steps.StepResponse` describes it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Explanation(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
-    """The members in the order in which they are written; what they mean is said in `StepResponse`."""
+    """The members in the order in which they are written. `StepResponse` says what they mean."""
 
     t: int
     mode: str

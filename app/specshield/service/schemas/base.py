@@ -1,4 +1,4 @@
-"""What every schema shares, and problems. Metres, radians counter-clockwise, map frame (REP-103)."""
+"""What all schemas share, and problems. Metres, radians counter-clockwise, map frame (REP-103)."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ Id = Annotated[str, Field(pattern=f"^{ID}$")]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Pose = Annotated[
     list[Coordinate],
-    Field(min_length=3, max_length=3, fail_fast=True, description="[x, y, theta]: [m, m, rad], map frame."),
+    Field(min_length=3, max_length=3, fail_fast=True, description="[x, y, theta] [m, m, rad], map frame."),
 ]
 Poses = Annotated[list[Pose], Field(min_length=1, max_length=10_001, fail_fast=True)]
 Point = Annotated[
     list[Coordinate],
     Field(min_length=2, max_length=2, fail_fast=True, description="[x, y] in metres, map frame."),
 ]
-MOST_UNKNOWN = 20  # fields of which each gets an error of its own
+MOST_UNKNOWN = 20  # unknown fields that get an error each
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class Strict(BaseModel):
     """Requests: no unknown fields, no conversions, no NaN or infinity.
 
-    Lists and dictionaries of theirs are `fail_fast`: a schema says of each member what is wrong with it, and
-    thousands of them would take long to say so.
+    Their lists and dictionaries are `fail_fast`: the errors of thousands of members would take long to make.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
@@ -45,42 +44,43 @@ class Strict(BaseModel):
 
 
 class FieldError(BaseModel):
-    path: str = Field(description="The field: `poses[0][2]`.")
-    got: JsonValue = Field(None, description="What it held, shortened.")
+    path: str = Field(description="The field, such as `poses[0][2]`.")
+    got: JsonValue = Field(None, description="What the field held, shortened.")
     expected: str = Field(description="What is valid.")
 
 
 class ProblemConjunct(BaseModel):
-    formula: str = Field(description="The part.")
+    formula: str = Field(description="This part of the rule.")
     feasible_alone: bool = Field(description="Whether a future was found that keeps this part by itself.")
     robustness: float | None = Field(
-        description="The highest found of it beside the other parts, or alone where those cannot be kept [m]."
+        description="The part's highest robustness that was found while the other parts are kept, or alone "
+        "if they cannot be kept [m]."
     )
     late_by: int | None = Field(
-        description="How many steps later its window would have to end, or to begin for `G[a,b] place`: for "
-        "this part alone where it is not feasible alone, else for the whole rule. Null where no such end was "
-        "found to do."
+        description="By how many steps the part's window would have to end later (for `G[a,b] place`: begin "
+        "later), so that the whole rule can be kept, or this part alone if it is not feasible alone. Null if "
+        "no such number was found."
     )
 
 
 class Problem(BaseModel):
-    """An error, as RFC 9457 has it. Other members may follow, such as `position` or `expected_t`."""
+    """An error in the form of RFC 9457. It may have more members, such as `position` or `expected_t`."""
 
     model_config = ConfigDict(extra="allow")
 
-    type: str = Field(description="A stable word to branch on, such as `history-gap`.")
-    title: str = Field(description="The word, readable.")
+    type: str = Field(description="A stable word for programs, such as `history-gap`.")
+    title: str = Field(description="The same word for people.")
     status: int = Field(description="The HTTP status.")
-    detail: str = Field(description="What was wrong, for a person.")
-    path: str | None = Field(None, description="The field at fault.")
+    detail: str = Field(description="What was wrong, for people.")
+    path: str | None = Field(None, description="The field that is wrong.")
     got: JsonValue = Field(None, description="What the field held, shortened.")
     expected: str | None = Field(None, description="What is valid there.")
     errors: list[FieldError] | None = Field(
-        None, description="Every field that failed, if there are several."
+        None, description="Every field that is wrong, where the schema refuses the request."
     )
-    retry_after: int | None = Field(None, description="Of `rate-limited`: as the header Retry-After says.")
+    retry_after: int | None = Field(None, description="Of `rate-limited`: the header Retry-After [s].")
     proved: bool | None = Field(
-        None, description="Of an infeasible rule: true where no future exists, false where none was found."
+        None, description="Of an infeasible rule: true if no future exists, false if none was found."
     )
     conjuncts: list[ProblemConjunct] | None = Field(
         None, description="Of an infeasible rule: what is wrong with each part that `and` joins."

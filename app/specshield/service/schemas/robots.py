@@ -1,4 +1,4 @@
-"""Robots: as they are sent with a policy, and as they are shown."""
+"""Robots, in the form in which requests for policies have them, and in the form in which they are shown."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Footprint(Strict):
 
 
 class ActionSpec(Strict):
-    name: Name = Field(description="Unlike the others'.")
-    translate: float = Field(0.0, description="Along the heading [m].")
-    rotate: float = Field(0.0, description="Counter-clockwise, after the translation [rad].")
-    terminal: bool = Field(False, description="Ends the main task: moves nothing, consumes no step.")
+    name: Name = Field(description="A name that no other action has.")
+    translate: float = Field(0.0, description="How far the robot moves along its heading [m].")
+    rotate: float = Field(0.0, description="How far it then turns counter-clockwise [rad].")
+    terminal: bool = Field(False, description="Whether it ends the main task, moving nothing, in no step.")
 
 
 class RobotSpec(Strict):
     footprint: Footprint
     on_contact: Literal["stay", "stop"] = Field(
-        "stay", description="What a move that would touch something does."
+        "stay", description="Whether a move that would touch something is not made, or stops there."
     )
     actions: list[ActionSpec] = Field(min_length=1, max_length=256, fail_fast=True)
 
@@ -41,8 +41,10 @@ class RobotSpec(Strict):
 class RobotResponse(BaseModel):
     name: str = Field(description="A preset's name; `custom` for a robot that came with a policy.")
     footprint: Footprint
-    on_contact: Literal["stay", "stop"] = Field(description="What a move that would touch something does.")
-    actions: list[ActionSpec] = Field(description="In the order of the logits.")
+    on_contact: Literal["stay", "stop"] = Field(
+        description="Whether a move that would touch something is not made, or stops there."
+    )
+    actions: list[ActionSpec] = Field(description="The actions in the order of the logits.")
 
 
 class RobotList(BaseModel):
@@ -51,7 +53,7 @@ class RobotList(BaseModel):
 
 
 def describe(robot: Robot) -> dict[str, Any]:
-    """As `RobotResponse` has it: a preset is told in full."""
+    """The robot in the form of `RobotResponse`."""
     return {
         "name": robot.name,
         "footprint": {"radius": robot.radius, "offset": list(robot.offset)},
