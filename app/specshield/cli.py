@@ -1,4 +1,4 @@
-"""The `specshield` command. Each command imports what it needs when it runs."""
+"""The `specshield` command. Each subcommand imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _about(
 
 
 def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
-    """A command line with these commands. What can be expected to go wrong is told in one line.
+    """Runs a command line with these commands. Expected errors are shown in one line.
 
     options: of the `typer.Typer`.
     """
@@ -56,8 +56,8 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
         sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
         sys.exit(NEEDS_SERVER)
-    gc.set_threshold(50_000)  # objects: what is imported stays, and to look at it took a tenth of a start
-    kernels = Path(sys.prefix) / "numba-cache"  # where `make` keeps them: what it compiled serves here too
+    gc.set_threshold(50_000)  # [objects]: collections took a tenth of a start, and modules are never freed
+    kernels = Path(sys.prefix) / "numba-cache"  # the folder of `make`, so that its compiled kernels are used
     if kernels.is_dir():
         os.environ.setdefault("NUMBA_CACHE_DIR", str(kernels))
     app = typer.Typer(
@@ -77,10 +77,10 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
     except SpecshieldError as error:
         from specshield.sim.progress import StatusLine
 
-        StatusLine().clear()  # where a command said what it was doing
+        StatusLine().clear()  # a command may have left a line there
         sys.exit(str(error))
     except OSError as error:
-        if error.filename is None:  # else it is most likely a file or folder that the caller named
+        if error.filename is None:  # with a name, it is most likely a file or folder that the caller named
             raise
         sys.exit(f"{error.filename} cannot be used: {error.strerror}")
     except ModuleNotFoundError as error:
@@ -95,7 +95,7 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
 
 
 def _commands() -> Iterator[Callable[..., None]]:
-    """The commands below, and those that other packages register as entry points."""
+    """The commands of this module and of specshield/commands, and those that other packages register."""
     from specshield.commands.check_drive import check_drive
     from specshield.commands.doctor import doctor
     from specshield.commands.export import export
@@ -118,7 +118,7 @@ def serve(
         bool, typer.Option("--insecure", help="Serve beyond this machine without asking for a key.")
     ] = False,
 ) -> None:
-    """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
+    """Run a server. Its settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, ..."""
     import uvicorn
 
     from specshield.service.heavy.pool import STARTS_WITHIN
@@ -127,18 +127,18 @@ def serve(
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
 
-    settings = _settings()  # what is wrong with them is said here, in one line
+    settings = _settings()  # errors in the settings end the command here, with one line
     _check_address(host, port)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
-    with ThreadPoolExecutor(1) as beside:  # the store starts while the imports take their time
+    with ThreadPoolExecutor(1) as beside:  # the store starts during the imports
         joined = beside.submit(embedded.join if embedded is not None else bool)
         if workers == 1:
-            gc.disable()  # what is imported stays; `startup.prepare` collects again
+            gc.disable()  # modules are never freed; `startup.prepare` enables collections again
             from specshield.service.app import create_app
-    joined.result()  # and so is why it does not start
+    joined.result()  # raises the error of a store that does not start
     if not insecure:
         _check_exposure(host, settings)
-    with contextlib.suppress(StoreError):  # a store that is away now may come
+    with contextlib.suppress(StoreError):  # the store may be away now and come later
         check_files(settings.store_url, settings.files_at, settings.store_timeout)
     options: dict[str, Any] = {
         "host": host,
@@ -156,7 +156,7 @@ def serve(
         "timeout_keep_alive": settings.keep_alive_timeout,
         "timeout_worker_healthcheck": STARTS_WITHIN,
     }
-    # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
+    # After its end, uvicorn raises the signal again that stopped it, which would skip the clean-up below.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if workers == 1:
         uvicorn.run(create_app(settings, embedded), **options)
@@ -171,12 +171,12 @@ def serve(
 
 def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
-    learner: Annotated[bool, typer.Option(help="Only what takes hours.", hidden=True)] = False,
+    learner: Annotated[bool, typer.Option(help="Only methods that learn.", hidden=True)] = False,
 ) -> None:
-    """Make the policies that are asked for, until stopped; policies that learn need torch.
+    """Make the policies that are asked for, until stopped. Methods that learn need torch.
 
-    Other packages may have jobs of their own: each entry point of the group specshield.queues is named like
-    the queue that its jobs wait in.
+    Other packages may have jobs too: each entry point of the group specshield.queues has the name of a queue
+    of jobs.
     """
     from specshield.service.storage.connect import naming
     from specshield.service.training.worker import serve as work
@@ -189,20 +189,19 @@ def worker(
 def verify(
     file: Annotated[Path, typer.Argument(help="A record: GET /v1/sessions/{id}/record.", show_default=False)],
     data_dir: Annotated[
-        Path | None, typer.Option(help="A server's data folder, for maps and policies that were sent to it.")
+        Path | None, typer.Option(help="A server's data folder with its maps and policies.")
     ] = None,
     models_dir: Annotated[
-        Path | None, typer.Option(help="Policies, one folder each; by default those shipped.")
+        Path | None, typer.Option(help="A folder of policies; by default those that come with specshield.")
     ] = None,
     maps_dir: Annotated[
-        Path | None, typer.Option(help="Maps, <name>.yaml beside its image; by default those shipped.")
+        Path | None, typer.Option(help="A folder of maps; by default those that come with specshield.")
     ] = None,
 ) -> None:
     """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
 
-    The exit status is 0 where all is as it was, 1 where something differs, 2 where map or policy are not at
-    hand, so that only the chain was checked, 3 where the file cannot be read, so that nothing was, 4 where a
-    step differs that another version decided.
+    The exit status is 0 if nothing differs, 1 if something does, 2 if only the chain could be checked, as map
+    or policy are missing, 3 if the file cannot be read, 4 if a step differs that another version decided.
     """
     from specshield.service import verify as verifying
     from specshield.service.settings import read_settings
@@ -218,7 +217,7 @@ def verify(
 
 
 def openapi() -> None:
-    """Print the API's description."""
+    """Print the API's description (OpenAPI)."""
     from specshield.service.app import create_app
     from specshield.service.settings import read_settings
 
@@ -226,40 +225,40 @@ def openapi() -> None:
 
 
 def demo(
-    runs: Annotated[int, typer.Option(help="Episodes a case.", min=1)] = 20,
-    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
+    runs: Annotated[int, typer.Option(help="Episodes of each case.", min=1)] = 20,
+    seed: Annotated[int, typer.Option(help="Seed of the starts, the model and the draws.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
-    stay: Annotated[bool, typer.Option("--open", help="Leave the service up, and its page.")] = False,
+    stay: Annotated[bool, typer.Option("--open", help="Keep the service and its page running.")] = False,
 ) -> None:
-    """The paper's two cases with and without the shield: a table, and a picture of each."""
+    """Run the paper's two cases with and without the shield; print a table and draw a picture of each."""
     from specshield.sim.demo import run_demo
 
     raise typer.Exit(run_demo(runs, seed, out, stay))
 
 
 def train(
-    case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1.")],
+    case: Annotated[str, typer.Option(help="A case of maps/, such as 1 or case1.")],
     method: Annotated[
-        str, typer.Option(help="reachability, planner, dqn, or what another package adds.")
+        str, typer.Option(help="reachability, planner, dqn, or one of another package.")
     ] = "reachability",
-    seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
-    option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
-    out: Annotated[Path | None, typer.Option(help="By default a folder of models/ that has none.")] = None,
-    resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
+    option: Annotated[list[str] | None, typer.Option(help="An option, as in units=128; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; by default a new one in models/.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on with a run that was killed.")] = False,
 ) -> None:
-    """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""
+    """Make a policy for a case. Methods that learn show their progress."""
     from specshield.sim import training
 
     training.train(case, method, seed, updates, option or [], out, resume)
 
 
 def _check_address(host: str, port: int) -> None:
-    """Raises InputError where no server can listen there."""
+    """Raises InputError if no server can listen there."""
     try:
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
-        reason = str(error.strerror).partition(" (")[0]  # which Python follows with the address as a tuple
+        reason = str(error.strerror).partition(" (")[0]  # Python adds the address as a tuple
         raise InputError(
             f"the server cannot listen on {host} at port {port}: {reason}",
             expected="an address of this machine and a free port; --port 0 takes any that is free",
@@ -267,23 +266,23 @@ def _check_address(host: str, port: int) -> None:
 
 
 def _check_exposure(host: str, settings: Settings) -> None:
-    """Raises InputError where anybody on the network could use the server."""
+    """Raises InputError if anybody on the network could use the server."""
     from specshield.service.access.commands import on_keys
     from specshield.service.access.site import is_loopback
 
     exposed = not is_loopback(host) and settings.api_key is None
     if exposed and not on_keys(lambda keys: keys.listed(), settings):
         raise InputError(
-            f"whoever reaches {host} could use this server, since it asks for no key",
+            f"everybody who reaches {host} could use this server, since it asks for no key",
             path="--host",
             got=host,
             expected="a key, by `specshield keys create` or SPECSHIELD_API_KEY; or an address that only this "
-            "machine reaches, as 127.0.0.1; or --insecure, where something in front decides who may",
+            "machine reaches, such as 127.0.0.1; or --insecure, if a proxy decides who may use the server",
         )
 
 
 def _settings() -> Settings:
-    """The settings, and a data folder that will do. Raises InputError."""
+    """The settings, whose data folder is checked. Raises InputError."""
     from specshield.service.library.files import check_writable
     from specshield.service.settings import read_settings
 

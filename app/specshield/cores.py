@@ -1,4 +1,4 @@
-"""How many processors this process may use, which in a container is seldom how many the machine has."""
+"""The number of processors that this process may use: in a container mostly fewer than the machine has."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 
 def cores() -> int:
-    """At least 1: what the scheduler allows this process, and no more than the share of its container."""
+    """How many processors the scheduler allows this process, at most its container's share, at least 1."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         group = Path("/proc/self/cgroup").read_text().partition("0::/")[2].partition("\n")[0]
@@ -20,8 +20,8 @@ def cores() -> int:
 
 
 def share(root: Path, group: str) -> float:
-    """How many processors a control group may use (cgroup v2): its own limit or the least of those of
-    the groups that it lies in, inf without one. root: where they are mounted. group: its path below that.
+    """How many processors a control group (cgroup v2) may use: the least limit of the group and of those that
+    contain it, inf without any. root: where the groups are mounted. group: its path below that.
     """
     least, folder = math.inf, root / group
     for each in (folder, *folder.parents):

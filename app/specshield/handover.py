@@ -1,4 +1,4 @@
-"""What a session takes along when another rule, map or robot holds from some step on, and how it is told."""
+"""What a session keeps at a switch of rule, map or robot, and how its rules and explanations are shown."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from specshield.shield.decision import Carry, Decision
 from specshield.shield.taught import Taught
 
 E = TypeVar("E")
-NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
+NEVER = -2  # the step of a decision that precedes no other, so that no pose is compared with what it foresaw
 
 
 def begun(way: bytes | None) -> Carry | None:
-    """What the first decision of a session is given. way: see `Carry`."""
+    """The `Carry` with which a session begins. way: its member."""
     return None if way is None else Carry(NEVER, np.empty((0, 3)), (), way=way)
 
 
 def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, t: int, later: int) -> Carry:
-    """What the last decision under the old rule hands to the first one under the new, whose windows count
-    from `later` steps later. t: the step at which the new rule begins, by its own clock.
+    """The memory that the first decision under a new rule gets from the last one under the old rule. t: the
+    step at which the new rule begins, by its own clock, which counts from `later` steps later.
 
-    What the map has learned stays where the map is the same, what is known of the robot where the robot is;
-    where both are and the clock goes on, so does what the last motion should have led to. Continuations are
-    of the old rule.
+    On the same map, what was learned of it is kept; for the same robot, what is known of its motions. With
+    both and the same clock, the pose that the last motion should have reached is kept too. Continuations are
+    not: they belong to the old rule.
     """
     carry = Carry(NEVER, np.empty((0, 3)), ()) if carry is None else carry
     stays = same_map and same_robot and later == 0
@@ -48,23 +48,21 @@ def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, t: int, 
 
 
 def check_main_task(over: bool, told: bool) -> None:
-    """over: whether the main task is; told: whether a step says so. Raises StepConflict where that is taken
-    back.
-    """
+    """Raises StepConflict if the main task was over and a step does not say so. told: what the step says."""
     if over and not told:
         said, expected = "an earlier step said that the main task is done, which cannot be taken back", "true"
         raise StepConflict(said, path="main_task_done", got=False, expected=expected)
 
 
 def finite(value: float) -> float | None:
-    """As it is told in JSON: None for what has no number there."""
+    """The value for JSON: None if it is infinite or NaN."""
     return value if math.isfinite(value) else None
 
 
 def explained(
     decision: Decision, form: Callable[[str, float | None, int | None, str | None], E]
 ) -> tuple[E | None, ...]:
-    """What is said of each action, in the form of an answer's; None for one that is allowed."""
+    """The explanation of each action, made by `form`; None for an allowed action."""
     return tuple(
         None if why is None else form(why.conjunct, finite(why.robustness), why.late_by, why.detail)
         for why in decision.explanations
@@ -72,7 +70,7 @@ def explained(
 
 
 def rule_told(about: Mapping[str, Any], begins: int, origin: int, clock: str, status: str) -> dict[str, Any]:
-    """A rule of a session as the contract shows it. about: its policies, and the task that they are for."""
+    """A rule of a session as the contract shows it. about: the fields of its policies and of their task."""
     return {
         "from": begins,
         "origin": origin,
@@ -85,7 +83,7 @@ def rule_told(about: Mapping[str, Any], begins: int, origin: int, clock: str, st
 
 
 def _learned(learned: bytes | None, later: int) -> bytes | None:
-    """What the map has learned, by a clock that begins so many steps later."""
+    """What was learned of the map, with steps by a clock that begins `later` steps later."""
     if not learned or not later:
         return learned
     known = Taught.from_bytes(learned)

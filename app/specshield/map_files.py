@@ -1,4 +1,4 @@
-"""A map as it lies in a folder: a `.yaml`, its image, and the areas that have names."""
+"""Reads a map from its files: a `.yaml`, its image, and its named areas."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from specshield.world.regions import Region
 
 
 def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
-    """The map of a `.yaml`, and the areas that `<name>.regions.json` beside it names, where that is there.
+    """The map of a `.yaml`, and the areas in `<name>.regions.json` beside it, if there is such a file.
 
-    The image is the PGM or PNG that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises
-    MapError, and ValueError where the areas are no JSON.
+    The image, beside it too, is the PGM or PNG that the YAML names, else `<name>.pgm` or `<name>.png`. Raises
+    MapError, and ValueError if the areas are no JSON.
     """
     metadata = None
     with suppress(OSError):

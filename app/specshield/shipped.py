@@ -1,6 +1,6 @@
-"""Where the maps and models that come with specshield are.
+"""The folders of the maps and models that come with specshield.
 
-A repository has maps/ and models/ beside app/; a wheel has them inside the package. SPECSHIELD_MAPS_DIR and
+In a repository they are beside app/, in a wheel inside the package. SPECSHIELD_MAPS_DIR and
 SPECSHIELD_MODELS_DIR name other folders.
 """
 

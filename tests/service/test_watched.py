@@ -104,7 +104,7 @@ def test_what_a_session_learned_of_its_map_is_told_and_drawn(client, begin, step
         svg = client.get("/v1/sessions/learns/image.svg").content
         image = next(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}image")).get("href")
         pixels = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2]))).convert("RGBA")
-        return b"Violet is what it found occupied" in svg, np.asarray(pixels)[::-1].reshape(-1, 4)
+        return b"violet cells were found occupied" in svg, np.asarray(pixels)[::-1].reshape(-1, 4)
 
     nothing = {"map_id": session["map_id"], "map_revision": 0, "occupied": [], "free": []}
     assert learned() == {"t": -1, **nothing}

@@ -1,1 +1,1 @@
-"""The commands of `specshield` that have a module of their own."""
+"""Commands of `specshield` that are not in cli.py."""

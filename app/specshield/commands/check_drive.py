@@ -1,4 +1,4 @@
-"""`specshield check-drive`: a recorded drive judged by a rule."""
+"""`specshield check-drive`: judges a recorded drive by a rule."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def check_drive(
         typer.Option(help="How long a step is, in seconds.", min=1e-3, max=86_400.0, show_default=False),
     ],
     topic: Annotated[
-        str | None, typer.Option(help="Poses in the map's frame. By default the only topic with poses.")
+        str | None, typer.Option(help="Topic of poses in the map's frame. By default the only one.")
     ] = None,
 ) -> None:
-    """Say whether a drive from a rosbag2 kept the rule of a policy, and from where it could not any more.
+    """Say whether a drive in a rosbag2 kept a policy's rule, and from which step on it could not be kept.
 
-    The exit status is 1 where the rule is broken, or open and no way was left to keep it; else 0.
+    The exit status is 1 if the rule is broken, or open with no way left to keep it; else 0.
     """
     from specshield.local import LocalShield
     from specshield.recordings import drive

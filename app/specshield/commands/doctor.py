@@ -1,4 +1,4 @@
-"""`specshield doctor`: what of an installation works, what does not, and what to do about it."""
+"""`specshield doctor`: checks an installation, and says what to do about each problem."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
     from specshield.service.settings import Settings
 
-CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
+CLOCK = 2.0  # [s] by which the clocks of this machine and of a server may differ
 State = Literal["ok", "note", "wrong"]
 
 
 class Finding(NamedTuple):
-    """state `note`: it works, and there is something to know. remedy: what to do, empty where it is ok."""
+    """state: `note` if it works, with something to know. remedy: what to do, "" if nothing."""
 
     state: State
     what: str
@@ -42,14 +42,14 @@ def doctor(
     url: Annotated[str | None, typer.Option(help="A server to look at as well.")] = None,
     port: Annotated[int, typer.Option(help="The port to serve on.", min=1, max=65535)] = 8000,
 ) -> None:
-    """Say what of this installation works, what does not, and what to do about it."""
+    """Check this installation, and say what to do about each problem."""
     wrong = sum(_shown(check) for check in _checks(url, port))
     print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
     raise typer.Exit(1 if wrong else 0)
 
 
 def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Finding]]]:
-    """Each imports its part of a server when it is due. A setting that is not valid is told once."""
+    """The checks. Each imports what it needs when it runs. Invalid settings are reported once."""
     yield from (_parts, _kernels)
     from specshield.service.settings import read_settings
 
@@ -63,7 +63,7 @@ def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Findin
 
 
 def _shown(check: Callable[[], Iterator[Finding]]) -> int:
-    """Prints what a check finds, and counts what is wrong."""
+    """Prints the findings of a check, and returns how many of them are wrong."""
     wrong = 0
     try:
         for finding in check():
@@ -88,13 +88,13 @@ def _parts() -> Iterator[Finding]:
         return
     yield Finding(
         "note",
-        "torch is not installed: policies are computed, and none learns (method `dqn`)",
-        "pip install 'specshield[train]' where that is wanted",
+        "torch is not installed: policies can be computed, but not learned (method `dqn`)",
+        "pip install 'specshield[train]', if you want that",
     )
 
 
 def missing_parts(module: str = "") -> list[str]:
-    """The packages of the extra `server` that are not installed, or whose `module` could not be imported."""
+    """The packages of the extra `server` that are not installed, or to which the missing `module` belongs."""
     asked = [each for each in requires("specshield") or () if re.search("extra == .server", each)]
     names = {re.split(r"[^\w.-]", each)[0] for each in asked}
     return sorted(name for name in names if name == module or not [*distributions(name=name)])
@@ -108,7 +108,7 @@ def _kernels() -> Iterator[Finding]:
     if mark is None:
         yield Finding(
             "note",
-            f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
+            f"no compiled kernel can be kept in {compiled.BASE}: every start compiles all of them",
             "set NUMBA_CACHE_DIR to a folder that can be written to",
         )
     elif mark.exists():
@@ -117,14 +117,14 @@ def _kernels() -> Iterator[Finding]:
         yield Finding(
             "note",
             f"the next start compiles the kernels that are missing; all of them take {TAKES} s on two cores",
-            "python -m specshield.service.startup does so now",
+            "python -m specshield.service.startup compiles them now",
         )
 
 
 def _disk(settings: Settings) -> Iterator[Finding]:
     from specshield.service.library.files import check_writable
 
-    there, files = settings.data_dir, Path(settings.files_at)  # which is no folder for a URL
+    there, files = settings.data_dir, Path(settings.files_at)  # a URL names no folder that exists
     of = "SPECSHIELD_DATA_DIR" if settings.data_url is None else "SPECSHIELD_DATA_URL"
     kept = [(of, files), (of, files / "maps"), (of, files / "policies")]
     for name, folder in (("SPECSHIELD_DATA_DIR", there), *kept):
@@ -206,7 +206,7 @@ def _server(url: str) -> Iterator[Finding]:
         yield Finding("wrong", f"no server answers at {url}: {error}", elsewhere)
         return
     said = _object(ready)
-    if said.get("status") != "ok" and "type" not in said:  # what /readyz answers, or a problem (RFC 9457)
+    if said.get("status") != "ok" and "type" not in said:  # neither the answer of /readyz nor a problem
         yield Finding("wrong", f"what answers at {url} is no specshield server", elsewhere)
         return
     if ready.status_code == 200:
@@ -226,13 +226,11 @@ def _server(url: str) -> Iterator[Finding]:
     if date is not None:
         apart = email.utils.parsedate_to_datetime(date).timestamp() - began
         if abs(apart) > CLOCK + 1.0:  # the header has whole seconds
-            yield Finding(
-                "note", f"the server's clock is {apart:+.0f} s from this one", "ntp on both machines"
-            )
+            yield Finding("note", f"the server's clock is {apart:+.0f} s from this one", "use ntp on both")
 
 
 def _object(answer: httpx.Response) -> dict[str, Any]:
-    """What an answer holds; nothing where that is no JSON object."""
+    """The JSON object that an answer holds; {} if it holds none."""
     try:
         found = answer.json()
     except ValueError:

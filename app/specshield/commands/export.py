@@ -1,4 +1,4 @@
-"""`specshield export`: a session as a file that other tools open."""
+"""`specshield export`: writes a session as a file for other tools."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 
 from specshield.errors import InputError, NotFound
 
-if TYPE_CHECKING:  # every command line reads this module
+if TYPE_CHECKING:  # every command imports this module
     from specshield.world.regions import Region
 
 
@@ -27,16 +27,16 @@ def export(
     to: Annotated[
         Literal["mcap", "csv", "parquet", "rrd"], typer.Option(help="mcap opens in Foxglove, rrd in Rerun.")
     ],
-    out: Annotated[Path | None, typer.Option(help="By default the session's id with the ending.")] = None,
-    url: Annotated[str, typer.Option(help="The server that keeps the session.")] = "http://127.0.0.1:8000",
+    out: Annotated[Path | None, typer.Option(help="The file; by default named by the session's id.")] = None,
+    url: Annotated[str, typer.Option(help="The server that has the session.")] = "http://127.0.0.1:8000",
     api_key: Annotated[
-        str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="Its key, where it asks for one.")
+        str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="A key, if the server asks for one.")
     ] = None,
     step_seconds: Annotated[
         float, typer.Option(help="How long a step took, in seconds.", min=1e-3, max=86_400.0)
     ] = 1.0,
 ) -> None:
-    """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun; needs the extra `recordings`."""
+    """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun. Needs the extra `recordings`."""
     from specshield.client import ShieldClient
     from specshield.recordings.recording import map_of_service, of_record
     from specshield.service.library.maps import Maps
@@ -57,7 +57,7 @@ def export(
             with suppress(NotFound):  # a map may be deleted once its sessions are closed
                 grid, rooms = map_of_service(client, found.configs[0].map_id)
     if grid is None:
-        typer.echo("the map is not at hand: it is left out, and so are the ways ahead", err=True)
+        typer.echo("the map is not available: it is left out, and so are the ways ahead", err=True)
     recording = of_record(found, grid, rooms, step_seconds)
     path = out or Path(f"{recording.id}.{to}")
     try:
@@ -67,6 +67,6 @@ def export(
             f"{path} cannot be written: {error.strerror or error}",
             path="--out",
             got=str(path),
-            expected="a file in a folder that is there",
+            expected="a file in a folder that exists",
         ) from None
     typer.echo(f"{path}: {len(recording.items)} steps")

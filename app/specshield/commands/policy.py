@@ -1,4 +1,4 @@
-"""`specshield policy`: a policy for one's own map, rule and robot, from files, in one command."""
+"""`specshield policy`: makes a policy for your own map, rule and robot from files."""
 
 from __future__ import annotations
 
@@ -11,30 +11,28 @@ import typer
 
 from specshield.errors import InputError, PolicyError
 
-if TYPE_CHECKING:  # every command line reads this module
+if TYPE_CHECKING:  # every command imports this module
     from specshield.client import Map, Policy, ShieldClient
     from specshield.sim.progress import StatusLine
 
-URL_HELP = "A server that runs already, with the key SPECSHIELD_API_KEY; else one on SPECSHIELD_DATA_DIR."
-LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
+URL_HELP = "A running server (key: SPECSHIELD_API_KEY). By default one is started on SPECSHIELD_DATA_DIR."
+LARGEST = 64 << 20  # [bytes] of a file: a server's limit for a map
 
 
 def policy(
     map: Annotated[
-        str, typer.Option(help="A map's file, a grid's or a house's; else a map's name on the server.")
+        str, typer.Option(help="The file of a map, a grid or a house, or a map's name on the server.")
     ],
-    rule: Annotated[
-        str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
-    ],
-    regions: Annotated[Path | None, typer.Option(help="Places of your own by name, JSON or YAML.")] = None,
-    robot: Annotated[str, typer.Option(help="A preset, or your robot's JSON or YAML.")] = "stretch",
+    rule: Annotated[str, typer.Option(help="The rule, such as 'F[0,60] Kitchen and G[0,60] not Hall'.")],
+    regions: Annotated[Path | None, typer.Option(help="Your own places by name, JSON or YAML.")] = None,
+    robot: Annotated[str, typer.Option(help="A preset, or your robot as JSON or YAML.")] = "stretch",
     assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON or YAML.")] = None,
     method: Annotated[str, typer.Option(help="How the policy is made.")] = "reachability",
-    name: Annotated[str | None, typer.Option(help="What to call the policy.")] = None,
+    name: Annotated[str | None, typer.Option(help="A name for the policy.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
     url: Annotated[str | None, typer.Option(help=URL_HELP)] = None,
 ) -> None:
-    """Make a policy for a map, a rule and a robot of your own, and draw from where the rule can be kept."""
+    """Make a policy for your own map, rule and robot, and draw the starts from which it can keep the rule."""
     from specshield.commands.serving import client_of
     from specshield.service.library.files import check_writable
     from specshield.sim.progress import StatusLine
@@ -42,7 +40,7 @@ def policy(
     check_writable(out, "--out")
     status = StatusLine()
     places = {} if regions is None else _read(regions, "--regions")
-    machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # else a preset's name
+    machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # a file, or a preset's name
     send = _map(map, assets)
     with client_of(url, status, worker=True) as client:
         world = send(client)
@@ -68,7 +66,7 @@ def policy(
     print(f"picture {picture}")
     following = f"specshield run {called}" if url is None else f"a session of policy {called!r} at {url}"
     print(f"next    {following}")
-    raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: it can keep it from nowhere
+    raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: no start can keep the rule
 
 
 def _show(status: StatusLine, found: Policy) -> None:
@@ -79,8 +77,8 @@ def _show(status: StatusLine, found: Policy) -> None:
 
 
 def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
-    """How the server comes to the map: a file is sent, which is read at once; anything else is the id or the
-    name of one that it has.
+    """A function that gets the map from the server: it sends a file, which is read now, or finds the server's
+    map of this id or name.
     """
     path = Path(map)
     content = _read(path, "--map") if path.suffix or path.is_file() else None
@@ -111,7 +109,7 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
 
 
 def _read(path: Path, option: str) -> dict[str, Any]:
-    """An object in JSON or YAML. Raises InputError where the file cannot be read or holds none."""
+    """The object in a JSON or YAML file. Raises InputError if the file cannot be read or has none."""
     import yaml
 
     from specshield.world.checks import shown
@@ -124,8 +122,8 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        document = text.rstrip().removesuffix("\n---")  # with which `ros2 topic echo` ends a message
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C is seven times as fast
+        document = text.rstrip().removesuffix("\n---")  # `ros2 topic echo` ends a message with that
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in C is seven times as fast
         value = json.loads(text) if path.suffix == ".json" else yaml.load(document, loader)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None

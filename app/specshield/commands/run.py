@@ -1,4 +1,4 @@
-"""`specshield run`: a simulated episode with a policy of one's own, drawn."""
+"""`specshield run`: drives a simulated robot with a policy, and draws its way."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import typer
 
 from specshield.errors import InputError
 
-if TYPE_CHECKING:  # every command line reads this module
+if TYPE_CHECKING:  # every command imports this module
     from specshield.sim.cases import Case
 
 
 def run_policy(
     policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
-    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 in metres.")] = None,
-    seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
-    shaping: Annotated[str, typer.Option(help="As a session has it: projection, lookahead.")] = "projection",
+    target: Annotated[str | None, typer.Option(help="The model's target, as 2.5,1.0 in metres.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the start, the target and the model.", min=0)] = 0,
+    shaping: Annotated[str, typer.Option(help="A session's shaping: projection, lookahead.")] = "projection",
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
 ) -> None:
     """Drive a simulated robot through an episode, with and without the shield, and draw both."""
@@ -56,8 +56,8 @@ def run_policy(
 
 
 def _case(id: str, name: str, target: tuple[float, float] | None, seed: int) -> Case:
-    """The policy's task as the simulation takes it, from the data folder. target [m]: without it a place
-    drawn by `seed`.
+    """The simulation's case for a policy in the data folder. target [m]: by default a random place that
+    `seed` decides.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""The server that a command asks: one that runs already, or one of its own on the same data folder."""
+"""The server of a command: one that runs already, or one that the command starts on the data folder."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from specshield.client import ShieldClient
 from specshield.sim.progress import StatusLine
 from specshield.sim.service import own_server
 
-PATIENCE = 30.0  # [s] for one answer: other work may share the machine
+PATIENCE = 30.0  # [s] for one answer: the machine may be busy
 
 
 @contextmanager
 def client_of(url: str | None, status: StatusLine, worker: bool = False) -> Iterator[ShieldClient]:
-    """A client of the server at `url`. Without one a server is started, which keeps what it makes.
+    """A client of the server at `url`, or of one that is started for the block on the data folder.
 
-    The client shows the key of SPECSHIELD_API_KEY. worker: whether policies are to be made there.
+    The client uses the key of SPECSHIELD_API_KEY. worker: whether the started server makes policies.
     """
     key = os.environ.get("SPECSHIELD_API_KEY") or None
     if url is not None:

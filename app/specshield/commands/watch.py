@@ -1,4 +1,4 @@
-"""`specshield watch`: the decisions of a session in the terminal, as they are made."""
+"""`specshield watch`: shows the decisions of a session in the terminal as they are made."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-if TYPE_CHECKING:  # every command line reads this module
+if TYPE_CHECKING:  # every command imports this module
     from specshield.client import Decision
 
 HEAD = "    t mode           action       rule  feasible      KL   rho m   off by m"
@@ -16,10 +16,10 @@ HEAD = "    t mode           action       rule  feasible      KL   rho m   off b
 def watch(
     session: Annotated[str, typer.Argument(help="Id of a session.")],
     url: Annotated[str, typer.Option(help="The server (key: SPECSHIELD_API_KEY).")] = "http://127.0.0.1:8000",
-    after: Annotated[int, typer.Option(help="Begin after this step; -1: from the first.", min=-1)] = -1,
+    after: Annotated[int, typer.Option(help="Begin after this step; -1: at the first one.", min=-1)] = -1,
     limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
 ) -> None:
-    """Show the decisions of a session as they are made, a line each."""
+    """Show the decisions of a session as they are made, one in each line."""
     from specshield.client import ShieldClient
 
     with ShieldClient(url, api_key=os.environ.get("SPECSHIELD_API_KEY")) as client:
@@ -39,7 +39,7 @@ def watch(
 
 
 def line(decision: Decision) -> str:
-    """One decision; what was not evaluated is a dash."""
+    """A decision as a line, with a dash for each value that was not computed."""
     rho = decision.robustness[decision.action]
     off = None if decision.residual is None else decision.residual.translation
     mode = decision.mode if decision.reason is None else f"{decision.mode}*"

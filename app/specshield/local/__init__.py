@@ -1,4 +1,4 @@
-"""The shield in process: the interface of the SDK's sessions without a server.
+"""The shield in this process, without a server: its sessions have the interface of the SDK's.
 
     from specshield.local import LocalShield
 
@@ -8,7 +8,7 @@
             decision = session.step(robot.pose(), model.logits())
             robot.execute(decision.execute)
 
-For training loops, tests and recordings. Nothing is stored: a session ends with its process.
+It serves training loops, tests and recordings. Nothing is stored: a session ends with its process.
 """
 
 from specshield.local.session import LocalSession

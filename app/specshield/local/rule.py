@@ -1,4 +1,4 @@
-"""A rule that a session in process has, or had."""
+"""A rule, present or earlier, of a session in this process."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ CLOCKS = ("keep", "restart")
 
 @dataclass(frozen=True)
 class Rule:
-    """begins: the first step that it decides. origin: the step from which its windows count, and its history.
-    shield: with the session's settings, told in steps from `origin`, as the core counts them.
+    """begins: the first step that the rule decides. origin: the step from which its windows and its history
+    count. shield: with the session's settings; like the core, it counts steps from `origin`.
     """
 
     policy: LocalShield
@@ -35,7 +35,7 @@ class Rule:
     clock: str = "restart"
 
     def followed_by(self, policy: LocalShield, shaping: str, t: int, clock: str) -> Rule:
-        """The rule that holds from step t on. Each origin has a seed of its own, as on a server."""
+        """The next rule, which begins at step t. As on a server, each origin has its own seed."""
         if clock not in CLOCKS:
             raise InputError("no such clock", path="clock", got=clock, expected=" or ".join(CLOCKS))
         origin, config = t if clock == "restart" else self.origin, self.shield.config
@@ -44,11 +44,11 @@ class Rule:
         return Rule(policy, policy.configured(settings, shaping), t, origin, clock)
 
     def since(self, poses: Sequence[Pose]) -> Floats:
-        """The poses that it looks at."""
+        """The poses from the rule's origin on."""
         return np.array(poses[self.origin :]).reshape(-1, 3)
 
     def signals(self, held: Mapping[str, Sequence[float]], length: int | None = None) -> dict[str, Floats]:
-        """Those that it reads, where it looks, of the first `length` steps."""
+        """The samples that the rule reads, from its origin to before step `length`."""
         return {name: np.array(held[name][self.origin : length]) for name in self.shield.task.signals}
 
     def verdict(
@@ -62,7 +62,7 @@ class Rule:
 def told(
     rules: Sequence[Rule], poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
 ) -> tuple[dict[str, Any], ...]:
-    """As the contract shows them, each with the verdict on the states up to the last one that it led to."""
+    """The rules as the contract shows them, each with the verdict on the states to which it led."""
     seen = [*(poses[: rule.begins + 1] for rule in rules[1:]), poses]
     return tuple(
         rule_told(rule.policy.about(), rule.begins, rule.origin, rule.clock, rule.verdict(known, held)[0])

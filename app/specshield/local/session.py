@@ -1,4 +1,4 @@
-"""A session in process: what the SDK's `Session` is, decided here."""
+"""A session in this process, with the interface of the SDK's `Session`."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from specshield.task import Task, check_signals
 if TYPE_CHECKING:
     from specshield.local.shield import LocalShield
 
-OWN = ("execute", "timings", "source", "action_names")  # what the SDK adds to the answer of the contract
-ASKED = ("witnesses", "explanations", "any_signal", "detail")  # told where there is something to say
+OWN = ("execute", "timings", "source", "action_names")  # fields of the SDK that the contract does not have
+ASKED = ("witnesses", "explanations", "any_signal", "detail")  # fields that the contract leaves out if None
 
 
 class LocalSession:
-    """As `specshield.client.Session`: `t` is the next step, and a `step` that raises leaves all as it was.
+    """Like `specshield.client.Session`: `t` is the next step, and a `step` that raises changes nothing.
 
-    What differs, since nobody is asked and nothing waited for: `switch` takes a LocalShield; `events` ends
-    with what is decided by now; a decision cannot be broken off, so that a `deadline` is taken and not kept.
+    Three things differ, as there is no server: `switch` takes a LocalShield; `events` does not wait for
+    further decisions; a `deadline` is accepted but not kept, since a decision cannot be interrupted.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class LocalSession:
         self.spec_status: SpecStatus = info.spec_status
         self.finished = self.main_task_done = self.closed = False
         self._told_done = False  # whether the last step said that the main task is done
-        self._over = False  # whether a server would refuse what follows: it is not told of a drawn `end`
+        self._over = False  # whether a server would refuse further steps: it does not know of a drawn `end`
         self._shaping = shaping
         self._rules = [Rule(policy, shield)]
         self._first = dict(shield.task.signals)
@@ -71,7 +71,7 @@ class LocalSession:
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
-        self._given = {0: initial_pose}  # x_t of the next step, where its beginning or a switch told it
+        self._given = {0: initial_pose}  # x_t of the next step, if the beginning or a switch has given it
 
     @property
     def id(self) -> str:
@@ -88,7 +88,7 @@ class LocalSession:
 
     @property
     def _known(self) -> list[Pose]:
-        """The poses up to x_t where that is told already, else up to the one before it."""
+        """The poses up to x_t if that was given already, else up to x_{t-1}."""
         return [*self._poses, *(pose for t, pose in self._given.items() if t == self.t)]
 
     def __enter__(self) -> LocalSession:
@@ -111,10 +111,10 @@ class LocalSession:
         explain: bool = False,
         deadline: float | None = None,
     ) -> Decision:
-        """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
+        """Decide step t from x_t = (x, y, theta) and one logit for each action; run `decision.execute`.
 
-        The arguments are those of the SDK's `Session.step`, so that one loop serves both; `deadline` does
-        nothing here. Raises what that raises where the caller is wrong.
+        The arguments are those of the SDK's `Session.step`, so that one loop serves both; `deadline` has no
+        effect. Raises the same errors of the caller.
         """
         wire.check_flags(main_task_done=main_task_done, witnesses=witnesses, explain=explain)
         over = bool(self.main_task_done if main_task_done is None else main_task_done)
@@ -122,7 +122,7 @@ class LocalSession:
             wire.seconds_value(deadline, "deadline")
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
-        check_signals(self._first, sent)  # what another rule of the session reads is kept, too
+        check_signals(self._first, sent)  # signals of the session's other rules are kept too
         x_t = self._at(pose)
         held = self._held(sent)
         made = episode.decide(
@@ -148,25 +148,25 @@ class LocalSession:
         return answer
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step that goes without a decision, and move on to t + 1. One told before stands."""
+        """Note x_t of a step without a decision, and go on to t + 1. An x_t that was given before counts."""
         x_t = wire.pose_values(pose)
         self._arrived(self._given.get(self.t, x_t), self._held({}))
 
     def switch(
         self, policy: LocalShield, *, clock: Literal["keep", "restart"] = "keep", pose: Numbers | None = None
     ) -> SessionInfo:
-        """Go on under another rule, on another map or for another robot, from the next step on.
+        """Go on under another rule, on another map or with another robot, from the next step on.
 
-        `clock` and `pose` are those of the SDK's `Session.switch`. Raises InfeasibleSwitch where the new rule
-        cannot be kept from there; nothing is changed then.
+        `clock` and `pose` are those of the SDK's `Session.switch`. Raises InfeasibleSwitch if the new rule
+        cannot be kept from x_t; nothing is changed then.
         """
         if not isinstance(policy, type(self._rule.policy)):
-            wrong = "this is no policy in process"
+            wrong = "this is no LocalShield"
             raise InputError(wrong, path="policy", got=policy, expected="a LocalShield")
         given = self._given.get(self.t) if pose is None else self._at(pose)
         old, made = self._rule, (policy.card["id"], self.t, clock)
         if len(self._rules) > 1 and made == (old.policy.card["id"], old.begins, old.clock):
-            return self.info  # this very switch was made last
+            return self.info  # the last switch was the same one
         self._check(self.main_task_done)
         x_t = self._foreseen() if given is None else given
         rule = old.followed_by(policy, self._shaping, self.t, clock)
@@ -198,8 +198,8 @@ class LocalSession:
         return info
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
-        """The decisions after step `after`, by default those that follow; -1: from the first. It ends with
-        what is decided when it is asked for the next.
+        """The decisions after step `after`, by default those from now on; -1: from the first. It ends at the
+        first step that is not decided yet.
         """
         t = self.t if after is None else after + 1
         while t < self.t:
@@ -208,7 +208,7 @@ class LocalSession:
             t += 1
 
     def close(self, pose: Numbers | None = None) -> Verdict:
-        """End the session; `pose` is the state the last action led to. Closing again changes nothing."""
+        """End the session. `pose` is the state to which the last action led. Once is enough."""
         if not self.closed and pose is not None:
             self._arrived(self._at(pose), self._held({}))
         poses = self._known
@@ -218,7 +218,7 @@ class LocalSession:
         return Verdict(self.spec_status, (low, high))
 
     def trajectory(self) -> tuple[TrajectoryItem, ...]:
-        """The states x_0..x_t, and the answers by the contract's names."""
+        """The states x_0 .. x_t, with the answers (the contract's names)."""
         held = self._held({}, len(self._known))
         return tuple(
             TrajectoryItem(t, pose, {name: held[name][t] for name in reads}, self._told(t), rule)
@@ -228,7 +228,7 @@ class LocalSession:
         )
 
     def _arrived(self, x_t: Pose, held: dict[str, list[float]]) -> None:
-        """Move on to t + 1. x_t is the last state of a rule that was left, where its action led there."""
+        """Goes on to step t + 1. After a switch, x_t is also the last state of the rule that was left."""
         self._poses.append(x_t)
         self._signals = held
         if 0 < self.t == self._rules[-1].begins:
@@ -243,27 +243,27 @@ class LocalSession:
         handover.check_main_task(self.main_task_done, over)
 
     def _foreseen(self) -> Pose:
-        """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""
+        """The pose to which the last decision's action leads. Raises HistoryGap without such a decision."""
         last = self._decisions.get(self.t - 1)
         if last is None:
             raise HistoryGap(f"nothing says where the robot is at step {self.t}", path="pose", expected="x_t")
         return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:
-        """x_t. Raises HistoryConflict where the session's beginning, or a switch, told another one."""
+        """x_t. Raises HistoryConflict if the session's beginning, or a switch, gave another x_t."""
         x_t = wire.pose_values(pose)
         told = self._given.get(self.t, x_t)
         gap = [a - b for a, b in zip(x_t, told, strict=True)]
         if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > SAME_POSE:
-            conflict = f"the pose of step {self.t} is not the one told before"
+            conflict = f"the pose of step {self.t} is not the one that was given before"
             raise HistoryConflict(conflict, path="pose", got=list(x_t), expected=f"{list(told)}")
         return told
 
     def _held(
         self, sent: Mapping[str, float], length: int | None = None, first: Mapping[str, float] | None = None
     ) -> dict[str, list[float]]:
-        """The signals up to `length` steps, by default those with the step that is decided now. A signal
-        that is not sent holds its last value, at first that of `first`, by default the rules' own.
+        """The samples of the signals for `length` steps, by default up to the step that is decided now. A
+        signal that is not sent keeps its last value, at first that in `first`, by default the rules' own.
         """
         n = len(self._poses) + 1 if length is None else length
         held = {}
@@ -286,7 +286,7 @@ class LocalSession:
 
 
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:
-    """The decision of the core as the SDK has it."""
+    """The core's decision in the SDK's form."""
     names = {each.name for each in fields(Decision)}
     values = {name: value for name, value in made._asdict().items() if name in names}
     values |= {
@@ -302,5 +302,5 @@ def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool,
 
 
 def _told(made: Decision | Explanation) -> dict[str, Any]:
-    """As the service tells it: without what there is nothing to say of."""
+    """The fields without those that the contract leaves out."""
     return {name: value for name, value in vars(made).items() if value is not None or name not in ASKED}

@@ -1,4 +1,4 @@
-"""What a session in process may be begun with: the settings and the bounds that a server has."""
+"""The settings of a session in this process, with the same bounds as on a server."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from specshield.shield.uncertainty import MOST_TRANSLATION, Uncertainty
 
 
 class Kind(NamedTuple):
-    """What a setting may be: in words, and as a test."""
+    """The valid values of a setting: in words, and as a test."""
 
     told: str
     holds: Callable[[Any], bool]
@@ -58,8 +58,8 @@ KNOWN: Mapping[str, Kind] = {
 
 
 def read_settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those that are given, and those that have another default than the core's. `uncertainty` as the core
-    has it. Raises InputError with the path of the one at fault.
+    """The given settings, with the defaults that differ from the core's and `uncertainty` in the core's form.
+    Raises InputError with the path of the wrong setting.
     """
     values = _read({"uncertainty": "learned", "learn_map": True, **given}, SETTINGS)
     told = values["uncertainty"]
@@ -81,7 +81,7 @@ def _read(given: Mapping[str, Any], kinds: Mapping[str, Kind], at: str = "") -> 
 
 
 def plain(value: Any) -> Any:
-    """Arrays and numbers of numpy, wherever they are in it, as lists and numbers of Python."""
+    """The value with lists and numbers of Python in place of those of numpy, also in its members."""
     if isinstance(value, Mapping):
         return {name: plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""A shield in process, prepared once for many sessions."""
+"""A shield in this process, prepared once for many sessions."""
 
 from __future__ import annotations
 
@@ -46,9 +46,8 @@ World = OccupancyGrid | Path | str | Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False, repr=False)  # in full it has millions of letters
 class LocalShield:
-    """A task and the policy that proposes futures for it. `session` begins an episode.
-
-    card, weights: the policy's files, as `save` writes them.
+    """A task and the policy that proposes futures for it. `session` begins an episode. card, weights: the
+    policy's files, as `save` writes them.
     """
 
     shield: Shield
@@ -61,7 +60,7 @@ class LocalShield:
 
     @staticmethod
     def shipped(name: str) -> LocalShield:
-        """A policy that came with specshield, such as `case1`. Raises NotFound."""
+        """The policy of this name that came with specshield, such as `case1`. Raises NotFound."""
         folder = MODELS / name
         names = sorted(card.parent.name for card in MODELS.glob("*/card.json"))
         if name not in names:
@@ -75,9 +74,8 @@ class LocalShield:
 
     @staticmethod
     def load(folder: str | Path, world: World | None = None) -> LocalShield:
-        """A policy from a folder: `card.json`, `policy.safetensors`, and its map unless `world` is given.
-
-        The map is the one `.yaml` in the folder, with its image beside it. Raises PolicyError, MapError.
+        """Read a policy from a folder with `card.json`, `policy.safetensors` and, unless `world` is given,
+        its map: the only `.yaml` there, with its image beside it. Raises PolicyError, MapError.
         """
         folder = Path(folder)
         try:
@@ -114,11 +112,11 @@ class LocalShield:
         seed: int = 0,
         check: bool = True,
     ) -> LocalShield:
-        """A policy made on the spot, by reachability in about a second.
+        """Make a policy, by reachability in about a second.
 
         world: a grid, the path of a map's `.yaml`, or a map as the API takes it in JSON, with its `format`.
-        rooms: named areas beside those that the map brings. check: whether to try some random starts, and to
-        warn of what they show. The rest is as in the SDK's `policies.create`.
+        rooms: named areas beside the map's own. check: whether to try some random starts, and to warn if they
+        show problems. The other arguments are those of the SDK's `policies.create`.
         """
         grid, own = _read_world(world)
         regions, robot, signals, options = map(plain, (regions, robot, signals, options))
@@ -137,7 +135,7 @@ class LocalShield:
         return LocalShield(make_shield([policy]), card, weights)
 
     def save(self, folder: str | Path) -> None:
-        """Write what `load` reads, which is also what a server takes in its folder of policies."""
+        """Write the files that `load` reads. A server takes them too, in a folder of its `models_dir`."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         text, image = dump_map(self.task.grid)
@@ -149,7 +147,7 @@ class LocalShield:
     def session(self, **options: Unpack[Beginning]) -> LocalSession:
         """Begin at `initial_pose`; the options are those of the SDK's `sessions.create`, without policies.
 
-        Raises PoseError, InfeasibleStart (unless `allow_infeasible`), and InputError for a setting.
+        Raises PoseError, InfeasibleStart (unless `allow_infeasible`), and InputError for a wrong setting.
         """
         given: dict[str, Any] = {**options}
         pose = pose_values(given.pop("initial_pose", None), "initial_pose")
@@ -184,7 +182,7 @@ class LocalShield:
         return shield if shaping == PROJECTION else replace(shield, preference=self._preference(shaping))
 
     def about(self) -> dict[str, Any]:
-        """What a session's info holds of its policy, and of the task that it is for."""
+        """The fields of a session's info that come from the policy and its task."""
         task = self.task
         return {
             "policy_ids": (str(self.card["id"]),),

@@ -1,4 +1,4 @@
-"""The application: its parts and their life."""
+"""The application: its parts, their start and their end."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 log = logging.getLogger("specshield")
-NEARLY = 1.0  # [s] after which a server that is not ready listens, to say so; chosen by hand
+NEARLY = 1.0  # [s] to wait for readiness before listening; chosen by hand
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
 set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
@@ -60,27 +60,27 @@ order: check a formula, send a map, begin a session, decide a step, close, read 
 
 
 class Application:
-    """The routes, and around them what every request passes, outside of FastAPI's own layers: a step needs
-    none of those, and would pay for each.
+    """The routes and the middlewares around them. These are outside of FastAPI, whose own layers a step does
+    not need and would have to wait for.
     """
 
     def __init__(self, routes: FastAPI, settings: Settings) -> None:
         self.routes = routes
         steps = StepRoute(StreamRoute(routes))
-        # Nothing is read for who may not ask.
+        # The guard comes before the bodies: nothing is read of a request that it refuses.
         self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = self.routes
         if scope.get("path") == "/docs":
-            scope["root_path"] = "."  # what it asks for is beside it, also where a proxy adds a path
+            scope["root_path"] = "."  # the page's addresses are relative, as a proxy may add a path
         await self._around(scope, receive, send)
 
 
 def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> Application:
-    """The application. Nothing is opened before it starts.
+    """The application. It opens nothing before it starts.
 
-    embedded: this process's share in the embedded store, where it has one already; left at the end.
+    embedded: the embedded store, if this process uses it already; the application leaves it at its end.
     """
     settings = settings or Settings()
     app = FastAPIOffline(
@@ -124,8 +124,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         check_files(url, settings.files_at, settings.store_timeout)
         if (told := drops(jobs.redis)) is not None:
             log.warning("%s; docs/scale.md says which it should be", told)
-        if worker is not None:  # last of all: it needs a processor for a second
-            with contextlib.suppress(OSError):  # `tend` tells, and tries again
+        if worker is not None:  # comes last, since it takes a processor for a second
+            with contextlib.suppress(OSError):  # `tend` logs the error and tries again
                 worker.ensure()
 
     watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping, lambda: steps.deciding)
@@ -138,7 +138,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
-    server.streams.close_at_stop()  # which comes when what follows has drained
+    server.streams.close_at_stop()  # before the next line, whose handler calls this one after the drain
     drain_at_sigterm(startup, settings.drain)
     running = (
         prepare(startup, check),
@@ -150,7 +150,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     )
     tasks = [asyncio.create_task(each) for each in running]
     try:
-        await asyncio.wait(tasks[:1], timeout=NEARLY)  # who asked now would be told to wait a second
+        await asyncio.wait(tasks[:1], timeout=NEARLY)  # a request now would be told to wait a second
         yield
     finally:
         for task in tasks:

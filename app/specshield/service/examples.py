@@ -1,4 +1,4 @@
-"""Requests for the docs page. From the top of the page down each of them works as it stands."""
+"""The example requests of the docs page. They work without changes in the order of the page."""
 
 from __future__ import annotations
 

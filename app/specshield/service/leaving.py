@@ -1,5 +1,5 @@
-"""How a server leaves: /readyz says so first, so that balancers send nothing new, and then it stops. What
-streams are open is told as soon as the server is. And how uvicorn's supervisor sees that one was killed.
+"""How a server stops: first /readyz says so, so that balancers send no new requests, and later the server
+stops and closes its streams. Also, how uvicorn's supervisor notices that a worker was killed.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 from prometheus_client.multiprocess import mark_process_dead
 from uvicorn.supervisors.multiprocess import Process
 
-if TYPE_CHECKING:  # the parent of several servers decides nothing
+if TYPE_CHECKING:  # the parent of several servers does not need it
     from specshield.service.startup import Startup
 
-GRACE = 10  # [s] that running requests and streams have once the server takes no more; chosen by hand
+GRACE = 10  # [s] for running requests and streams once the server takes no new ones; chosen by hand
 
 
 class Streams:
-    """What ends each stream of this process that is open, after the message that is being answered."""
+    """The open streams of this process: functions that end them after the message that is being answered."""
 
     def __init__(self) -> None:
         self.open, self.closed = set[Callable[[], None]](), False
@@ -32,7 +32,7 @@ class Streams:
             stop()
 
     def close_at_stop(self) -> None:
-        """Closes them as soon as the server is told to stop. To be called in the server's event loop."""
+        """Closes the streams when the server is told to stop. To be called in the server's event loop."""
         loop = asyncio.get_running_loop()
 
         def told(stop: Callable[[], object]) -> None:
@@ -43,7 +43,7 @@ class Streams:
 
 
 def drain_at_sigterm(startup: Startup, seconds: float) -> None:
-    """From SIGTERM on /readyz answers 503 and everything else goes on; `seconds` later the server stops.
+    """After SIGTERM, /readyz answers 503 and everything else goes on; `seconds` later the server stops.
 
     A second SIGTERM, or SIGINT, stops it at once. To be called in the server's event loop.
     """
@@ -60,11 +60,11 @@ def drain_at_sigterm(startup: Startup, seconds: float) -> None:
 
 
 def notice_killed() -> None:
-    """From now on the supervisor closes its own copy of a worker's end of the pipe between them, and the
+    """From now on uvicorn's supervisor closes its own copy of a worker's end of the pipe between them, and the
     metrics forget the streams of a worker that has ended.
 
-    It asks each worker for a sign of life through that pipe. With the copy open, it does not see the end of
-    one that is killed while it is asked, and waits as long as a worker may take to start.
+    The supervisor asks each worker for a sign of life through that pipe. While the copy is open, it does not
+    notice that a worker is killed meanwhile, and waits for as long as a worker may take to start.
     """
     start, join = Process.start, Process.join
 
@@ -81,8 +81,8 @@ def notice_killed() -> None:
 
 
 def _tell(told: Callable[[Callable[[], object]], None], *numbers: signal.Signals) -> None:
-    """Has `told` called for these signals, with what one did before; uvicorn puts its caller's handlers back
-    at the end. Not for a server inside another program, which has signals of its own.
+    """Has `told` called for these signals, with the former handler; uvicorn restores its caller's handlers at
+    the end. Does nothing outside the main thread: there the server is part of another program.
     """
     if threading.current_thread() is not threading.main_thread():
         return

@@ -1,8 +1,8 @@
-"""What /metrics counts and times; docs/watch.md lists it, with what is asked of the store at a scrape.
+"""The counts and times of /metrics. docs/watch.md lists them, with those that come from the store.
 
-Of several server processes where `PROMETHEUS_MULTIPROC_DIR` is set (cli.py does): each writes to files of its
-own there, which stay when the process ends, so no count ever goes back. What a step counts lies in `Cells`;
-the rest is prometheus_client's.
+If `PROMETHEUS_MULTIPROC_DIR` is set, as cli.py does for several server processes, /metrics has the sums over
+all of them: each process writes to its own files there, which outlive it, so that no count ever decreases.
+The counts of steps are in `Cells`, the others in prometheus_client.
 """
 
 from __future__ import annotations
@@ -81,26 +81,26 @@ def _request(method: str, route: str, status: int) -> tuple[Counter, Histogram]:
 
 
 def answered(method: str, route: str, status: int, seconds: float) -> None:
-    """A request was answered. The route is its template: what a caller makes up is no label."""
+    """Counts an answered request. route: its template, since a caller's paths must not become labels."""
     count, time = _request(method, route, status)
     count.inc()
     time.observe(seconds)
 
 
 def refused(type: str) -> None:
-    """A problem document was sent."""
+    """Counts a problem document that was sent."""
     _refusal[type].inc()
 
 
 def replayed() -> None:
-    """A step was answered from the store."""
+    """Counts a step that was answered from the store."""
     _held[replays.first] += 1.0
 
 
 def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) -> None:
-    """A step was decided, and is no replay; a line at debug tells of it.
+    """Counts a decided step, and logs it at the level debug.
 
-    told_later: the poses before x_t that came with it. timing: seconds of `rollout` and `store`.
+    told_later: how many poses before x_t came with it. timing: the seconds of `rollout` and `store`.
     """
     mass, residual = decision.feasible_mass, decision.residual
     _held[_MODE[decision.mode]] += 1.0
@@ -125,8 +125,8 @@ def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) ->
         logs.tell("decided", logging.DEBUG, **about, **ms)
 
 
-def exposition(gauges: Iterable[Metric] = ()) -> bytes:
-    """Prometheus text format: what all processes counted, and `gauges`."""
+def exposition(gauges: Iterable[Metric]) -> bytes:
+    """The counts of all processes, and `gauges`, in Prometheus' text format."""
     several = "PROMETHEUS_MULTIPROC_DIR" in os.environ
     counted: Any = multiprocess.MultiProcessCollector(None) if several else registry  # type: ignore[no-untyped-call]
     every: Any = SimpleNamespace(collect=lambda: [*counted.collect(), *cells.collect(), *gauges])

@@ -1,5 +1,5 @@
-"""Around every request: who may ask, request ids, Server-Timing, metrics, and a line of the log for what is
-refused. As plain ASGI, since Starlette's `@app.middleware` costs most of the throughput.
+"""The middlewares of every request: who may ask, request ids, Server-Timing, metrics, and a line of the log
+for a refused request. They are plain ASGI, since Starlette's `@app.middleware` costs most of the throughput.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from specshield.service.routes.stream import PATH
 from specshield.service.watch import logs
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-STARTED = secrets.token_hex(6)  # of this process; to ask for random bytes takes 5 % of a step
+STARTED = secrets.token_hex(6)  # begins the ids of this process: new random bytes would take 5 % of a step
 _count = itertools.count(1)
 
 
@@ -60,22 +60,22 @@ class Observe:
                 await problems.failed()(scope, receive, answer)
             raise
         finally:
-            status = scope["state"].get("status", status)  # of a request that nobody waits for any more
+            status = scope["state"].get("status", status)  # set if the caller has left
             route = getattr(scope.get("route"), "path", "other")
-            method = scope["method"] if route != "other" else "other"  # what a caller makes up is no label
+            method = scope["method"] if route != "other" else "other"  # callers may make up methods and paths
             metrics.answered(method, route, status, time.perf_counter() - start)
             if status >= 400:
                 type = scope["state"].get("problem", "error")
                 metrics.refused(type)
-                if status < 500:  # what failed has a line already that says more
+                if status < 500:  # a failure has been logged already
                     logs.tell("refused", type=type, status=status, method=method, route=route)
 
 
 class Guard:
-    """Who may ask: by the address, the page that asks, and the API key; and whether the server is ready.
+    """Refuses requests by address, page and API key, and all of them while the server is starting.
 
-    Refuses before anything of a body is read, and handshakes of WebSockets by the same rules and answers.
-    `scope["state"]` says who asks: `key`, its name as `owner`, and `rates`, which count what it asks.
+    It does so before anything of a body is read, and with the same answers for handshakes of WebSockets. It
+    writes into `scope["state"]`: `key`, its name as `owner`, and `rates`, which count the key's requests.
     """
 
     def __init__(self, app: ASGIApp, allowed_hosts: frozenset[str]) -> None:
@@ -94,7 +94,7 @@ class Guard:
     async def _check(self, scope: Scope, headers: dict[bytes, bytes]) -> None:
         check_site(scope, headers, self._allowed)
         path, server = scope["path"], scope["app"].state.server
-        # A route's pattern would take a newline: `$` stands before a last one too.
+        # A newline at the end has to be refused here: `$` in a route's pattern would match before it.
         if path.endswith("\n") or (scope["type"] == "websocket" and PATH.fullmatch(path) is None):
             raise NotFound(f"there is no {path!r} here", got=path, expected="a path listed at /docs")
         if guarded(path):

@@ -1,4 +1,4 @@
-"""Errors as problem documents (RFC 9457). One table gives each branch of the tree its HTTP status."""
+"""Errors as problem documents (RFC 9457). One table has the HTTP status of each branch of their tree."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
 MEDIA_TYPE = "application/problem+json"
-CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
+CLIENT_GONE = 499  # nginx's status for a request whose client has left; it is never sent
 log = logging.getLogger("specshield")
 
 
@@ -60,7 +60,8 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     SpecshieldError: 500,
 }
 
-# A field that fails its schema gets the type that its meaning would: clients branch on one word, not two.
+# The error for a field that fails its schema is that of a wrong value there, so that clients need one type
+# only.
 FIELD_ERRORS: Mapping[str, type[InputError]] = {
     "logits": errors.LogitsError,
     "poses": errors.PoseError,
@@ -70,12 +71,12 @@ FIELD_ERRORS: Mapping[str, type[InputError]] = {
     "formula": errors.FormulaError,
 }
 
-UNREADABLE: Mapping[type[Any], str] = {  # why a body whose reading failed so is no JSON
+UNREADABLE: Mapping[type[Any], str] = {  # by the error of parsing: why a body is no JSON
     RecursionError: "it is nested too deeply",
     UnicodeDecodeError: "its text is not UTF-8",
     ValueError: "a number has too many digits",
 }
-LISTS = ("errors", "conjuncts")  # stay the lists that they are: their entries were cut when they were made
+LISTS = ("errors", "conjuncts")  # are not shortened, since their entries are short already
 
 
 def status_of(error: SpecshieldError) -> int:
@@ -83,7 +84,7 @@ def status_of(error: SpecshieldError) -> int:
 
 
 def document(error: SpecshieldError) -> dict[str, Any]:
-    """type, title, status, detail; path, got and expected where there are; the error's own members."""
+    """type, title, status and detail; path, got and expected if the error has them; its other details."""
     body: dict[str, Any] = {
         "type": error.type,
         "title": error.type.replace("-", " ").capitalize(),
@@ -100,7 +101,7 @@ def document(error: SpecshieldError) -> dict[str, Any]:
 
 
 def plain(value: Any, room: int = 400) -> Any:
-    """`value` as finite JSON of bounded size; what is neither is shown as text."""
+    """`value` if it is finite JSON of bounded size, else a text that shows it."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, bytes):
@@ -115,7 +116,7 @@ def plain(value: Any, room: int = 400) -> Any:
 
 
 class ProblemResponse(Response):
-    """A problem document. Once it is sent, `scope["state"]["problem"]` is its type."""
+    """A problem document. When it is sent, its type is written into `scope["state"]["problem"]`."""
 
     def __init__(self, error: SpecshieldError, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(json.dumps(document(error)), status_of(error), headers, media_type=MEDIA_TYPE)
@@ -133,33 +134,33 @@ class ProblemResponse(Response):
 
 
 def failed() -> Response:
-    """For what nobody expected. Whoever sends it raises the error again: uvicorn writes the traceback to the
-    log and closes the connection, which the caller has to know before it asks there again.
+    """The answer after an unexpected error. The error is also raised again, so that uvicorn logs the
+    traceback and closes the connection: the header tells the caller that.
     """
     error = errors.ServerError("the server failed on this request; its log says more")
     return ProblemResponse(error, {"Connection": "close"})
 
 
 def tell(scope: Scope, error: SpecshieldError) -> Response:
-    """The answer, and a line of the log for what is this server's fault, or its store's."""
+    """The answer for an error, which is logged too if the server or its store is the reason."""
     if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
         log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], error.message)
     return ProblemResponse(error)
 
 
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:
-    """One error for everything a schema refused: the first in its own words, all of them in `errors`.
+    """One error for all that a schema refuses: its message is about the first, and `errors` has them all.
 
-    below: the field that the body is, where it is one part of what was sent.
+    below: the field of the request that `body` is, "" for the whole body.
     """
     if found[0]["type"] == "json_invalid":
         reason = found[0].get("ctx", {}).get("error", "")
         what = below or "the body"
         return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
-    if isinstance(body, bytes):  # not read at all
+    if isinstance(body, bytes):  # FastAPI has not read it
         told, expected = "the body is not declared as JSON", "the header Content-Type: application/json"
         return errors.UnsupportedMediaType(told, path="Content-Type", expected=expected)
-    # Where a word or an object would do, an object is told what it lacks, not that it is no word.
+    # Where a word and an object are valid, the errors of an object are about its members, not about the word.
     found = [
         e for e in found if e["type"] != "literal_error" or not isinstance(e.get("input"), dict)
     ] or found
@@ -206,7 +207,7 @@ def _expected(item: Mapping[str, Any]) -> str:
 
 
 def _path(item: Mapping[str, Any], body: Any) -> str:
-    """'poses[0][2]'. Left out: the names that pydantic puts in for the branch of a union."""
+    """The path as 'poses[0][2]', without the names by which pydantic marks the branch of a union."""
     source, *rest = item["loc"]
     if item["type"].startswith("union_tag"):
         rest.append(item["ctx"]["discriminator"].strip("'"))
@@ -234,7 +235,7 @@ def _held(value: Any, part: str | int) -> Any:
 
 
 def _allowed(request: Request) -> str:
-    """The methods of a path: Starlette names those of one route, and a path may have several."""
+    """All methods of a path, which may have several routes."""
     asked = [{**request.scope, "method": method} for method in ("DELETE", "GET", "PATCH", "POST", "PUT")]
     routes = request.app.routes
     return ", ".join(
@@ -243,7 +244,7 @@ def _allowed(request: Request) -> str:
 
 
 def install(app: FastAPI) -> None:
-    """Every way an answer can go wrong ends in a `ProblemResponse`."""
+    """Makes the app answer every error with a `ProblemResponse`."""
     from fastapi.exceptions import RequestValidationError  # the processes for heavy work need no FastAPI
 
     @app.exception_handler(SpecshieldError)
@@ -273,7 +274,7 @@ def install(app: FastAPI) -> None:
     @app.exception_handler(ClientGone)
     async def gone(request: Request, error: Exception) -> Response:
         request.scope["state"]["status"] = CLIENT_GONE
-        return Response(status_code=CLIENT_GONE)  # which nobody reads
+        return Response(status_code=CLIENT_GONE)  # nobody reads it
 
     @app.exception_handler(OSError)
     async def disk(request: Request, error: OSError) -> Response:

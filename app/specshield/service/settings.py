@@ -1,4 +1,4 @@
-"""What an operator can set, all of it by environment."""
+"""The settings of a server, all of them environment variables."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from specshield.service.access.site import AUTHORITY
 from specshield.service.storage.connect import FORMS, connect, is_cluster
 from specshield.service.storage.embedded import EmbeddedStore
 
-LONGEST = 24 * 3600  # [s] that a wait may be set to: timers do not take every number
-ALIKE = 0.9  # of a name's letters, by difflib: Kubernetes sets SPECSHIELD_PORT, SPECSHIELD_SERVICE_HOST...
+LONGEST = 24 * 3600  # [s], the most for times to wait: timers do not take every number
+ALIKE = 0.9  # difflib's ratio for a misspelt name; Kubernetes' SPECSHIELD_PORT, _SERVICE_HOST... have less
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
 class Settings(BaseSettings):
-    """Environment variables: the field names in upper case after `SPECSHIELD_`; REDIS_URL without it too."""
+    """Each variable is `SPECSHIELD_` and the field's name in upper case; REDIS_URL also works without it."""
 
     model_config = SettingsConfigDict(
         env_prefix="SPECSHIELD_", frozen=True, extra="ignore", env_ignore_empty=True
@@ -35,29 +35,29 @@ class Settings(BaseSettings):
     data_url: str | None = Field(
         None,
         description="Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the "
-        "same for all servers and workers of one store; unset, the data folder.",
+        "same for all servers and workers of one store. By default, the data folder.",
     )
-    models_dir: Path = Field(shipped.MODELS, description="Policies there at start, one folder each.")
-    maps_dir: Path = Field(shipped.MAPS, description="Maps there at start, <name>.yaml beside its image.")
+    models_dir: Path = Field(shipped.MODELS, description="Policies that every key may use, one folder each.")
+    maps_dir: Path = Field(shipped.MAPS, description="Maps that every key may use, <name>.yaml with image.")
     redis_url: str | None = Field(
         None,
         validation_alias=AliasChoices("redis_url", "REDIS_URL", "SPECSHIELD_REDIS_URL"),
-        description="The store, as storage/connect.py says; unset, the server starts its own.",
+        description="The store (storage/connect.py has the forms). By default the server starts its own.",
     )
     store_timeout: float = Field(2.0, gt=0, le=LONGEST, description="Longest wait for the store [s].")
     store_replicas: int = Field(
         0,
         ge=0,
         le=8,
-        description="Replicas of the store at REDIS_URL that have to have a step before it is answered.",
+        description="How many replicas of the store at REDIS_URL need to have a step before it is answered.",
     )
     api_key: SecretStr | None = Field(
-        None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
+        None, description="A key, for `Authorization: Bearer <key>`, beside those of `specshield keys`."
     )
     allowed_hosts: str = Field(
         "",
-        description="Names, with or without a port, that a request's Host may hold beside the server's own "
-        "address: that of a proxy in front, say. Separated by commas.",
+        description="Further names, with or without a port, that a request's Host may have, such as that of "
+        "a proxy. Separated by commas.",
     )
 
     max_horizon: int = Field(1000, ge=1, description="Longest horizon of a formula [steps].")
@@ -65,7 +65,7 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(1 << 20, ge=1024, description="Largest request body [bytes].")
     max_upload_bytes: int = Field(64 << 20, ge=1024, description="Largest map or policy sent [bytes].")
     max_bodies_bytes: int = Field(
-        128 << 20, ge=1 << 20, description="Most that all bodies being received may hold [bytes]."
+        128 << 20, ge=1 << 20, description="Most for all bodies that are being received, together [bytes]."
     )
     max_body_members: int = Field(
         10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
@@ -81,10 +81,10 @@ class Settings(BaseSettings):
         15.0,
         gt=0,
         le=LONGEST,
-        description="Longest that a request's head or body may take to arrive, or an answer stay unread [s].",
+        description="Longest time for a request's head or body to arrive, and for an unread answer [s].",
     )
     min_body_rate: int = Field(
-        64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."
+        64 << 10, ge=1, description="For each so many bytes, a body may take 1 s more [bytes]."
     )
     keep_alive_timeout: float = Field(
         30.0, gt=0, le=LONGEST, description="A connection without a request is closed after this long [s]."
@@ -93,7 +93,7 @@ class Settings(BaseSettings):
         20.0, gt=0, le=LONGEST, description="Longest that reading an upload or drawing a map may take [s]."
     )
     heavy_memory: int = Field(
-        1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."
+        1 << 30, ge=256 << 20, description="Most memory of a process that does that [bytes]."
     )
 
     max_owner_bytes: int = Field(
@@ -116,19 +116,19 @@ class Settings(BaseSettings):
     archive_after: int = Field(
         3600,
         ge=1,
-        description="A session that has not changed for so long moves to the archive [s]; one that has ended "
-        "does after 60 s, or after this long.",
+        description="A session that has not changed for so long moves to the archive [s]; an ended one does "
+        "after 60 s if this is longer.",
     )
     archive_bytes: int = Field(
         100 << 30,
         ge=1 << 20,
-        description="Where the archive holds so much, none moves there and none is begun [bytes].",
+        description="Once the archive has so many bytes, no session moves there and none is begun [bytes].",
     )
     drain: float = Field(
         0.0,
         ge=0,
         le=3600,
-        description="How long a server that was told to stop goes on answering, /readyz excepted [s].",
+        description="How long a server that was told to stop goes on answering, except at /readyz [s].",
     )
     shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
 
@@ -137,14 +137,14 @@ class Settings(BaseSettings):
         "text", description="Lines of the log, for people or for programs."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="The least that is logged; `debug` tells of each decision."
+        "info", description="The lowest level that is logged; `debug` logs each decision."
     )
 
     worker: bool | None = Field(
-        None, description="Start a training worker too. Unset: where the store is embedded."
+        None, description="Whether to start a training worker. By default, if the store is embedded."
     )
     complete: bool = Field(
-        True, description="Once ready, compile the kernels that only some rules and robots need, too."
+        True, description="Whether to compile, once ready, the kernels that only some rules and robots need."
     )
     training_timeout: int = Field(
         6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
@@ -164,10 +164,9 @@ class Settings(BaseSettings):
     @classmethod
     def _is_a_store(cls, url: str | None) -> str | None:
         try:
-            if url is not None and not is_cluster(url):
-                connect(url).connection_pool.make_connection()  # looks at all options, and opens nothing yet
-            elif url is not None:
-                connect(url)  # does so too
+            store = connect(url) if url is not None else None
+            if store is not None and not is_cluster(str(url)):
+                store.connection_pool.make_connection()  # checks all options, and opens nothing yet
         except (ValueError, TypeError):
             raise ValueError(f"a URL as {FORMS}") from None
         return url
@@ -200,12 +199,12 @@ class Settings(BaseSettings):
 
     @property
     def store_url(self) -> str:
-        """Of the store: of the one that the server starts where none is named."""
+        """The URL of the store at REDIS_URL, or of the embedded one."""
         return self.redis_url or EmbeddedStore(self.data_dir).url
 
     @property
     def files_at(self) -> str:
-        """Where maps, policies and archived sessions are: a folder, or an fsspec URL."""
+        """The folder, or the fsspec URL, of maps, policies and archived sessions."""
         return self.data_url or str(self.data_dir.resolve())
 
     def environment(self) -> dict[str, str]:
@@ -225,8 +224,8 @@ def _listed(names: str) -> list[str]:
 
 
 def read_settings() -> Settings:
-    """Those of this process's environment. Raises InputError, which names the variable at fault."""
-    if os.environ.get("SPECSHIELD_API_KEY") == "":  # empty counts as unset: nobody means an open server by it
+    """The settings of this process's environment. Raises InputError, which names the wrong variable."""
+    if os.environ.get("SPECSHIELD_API_KEY") == "":  # it would count as unset, which would open the server
         name, expected = "SPECSHIELD_API_KEY", "a key, or the variable not set"
         raise InputError(f"{name} is empty", path=name, expected=expected)
     if os.environ.get("SPECSHIELD_DATA_URL", "").startswith("memory:"):
@@ -234,7 +233,7 @@ def read_settings() -> Settings:
         expected = "a folder, or a URL that every process reaches"
         raise InputError(told, path="SPECSHIELD_DATA_URL", expected=expected)
     known = [f"SPECSHIELD_{field.upper()}" for field in Settings.model_fields]
-    for name in os.environ:  # a setting that is misspelt would be left out without a word
+    for name in os.environ:  # a misspelt setting would be ignored silently
         meant = get_close_matches(name, known, 1, ALIKE)
         if meant and name not in known:
             raise InputError(f"{name} is not a setting", path=name, expected=f"{meant[0]}, or not set")

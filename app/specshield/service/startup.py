@@ -1,10 +1,10 @@
-"""From a server's first moment until it is ready: what it does meanwhile, and how it tells how far it is.
+"""What a server does until it is ready, and how it tells its progress.
 
-    python -m specshield.service.startup     # does so without a server: for an image, say
+    python -m specshield.service.startup     # does the same without a server, as for an image
 
-The first start of an installation compiles the kernels, in a process for each part, and they stay on the
-disk. Any later start takes them from there. Of several server processes one compiles, the others wait for it.
-The kernels that only some rules and robots need are compiled once it is ready, at a low priority.
+The first start of an installation compiles the kernels, in one process for each part, and keeps them on the
+disk. Later starts take them from there. Of several server processes one compiles, and the others wait for it.
+The kernels that only some rules and robots need are compiled once the server is ready, at a low priority.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from specshield.errors import InputError, ServerError, SpecshieldError, Starting
 from specshield.service import warmup
 from specshield.service.storage.keeper import private
 
-# The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; `complete`, that those
-# are too which only some rules and robots need.
+# The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; the file `complete`,
+# that the kernels that only some rules and robots need are there too.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 70  # [s] a first start on two quiet cores, which took 29 to 73: `make wheels` prints what it takes
+TAKES = 70  # [s] of a first start on two quiet cores; 29 to 73 were measured (`make wheels` prints it)
 TELL_EVERY = 5.0  # [s] between two lines of the log
-LOW = 10  # niceness of what a server compiles in the background: 19 gets nowhere beside 8 busy programs
-CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
-# [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took
-# 18 us of a step and found none, with this 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
+LOW = 10  # niceness of compiling in the background: with 19 it makes no progress beside 8 busy programs
+CHECK_EVERY = 0.25  # [s] between two looks whether another process has compiled them
+# [objects] that are new before a collection looks for cycles among them. With Python's 700 that took 18 us of
+# a step and found none; with this number it takes 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
 YOUNG = 7_000
 log = logging.getLogger("specshield")
 
 
 @dataclass
 class Startup:
-    """How far a server has come.
+    """The progress of a server's start.
 
-    failure: why it will not be ready. compiling: whether kernels may be missing on the disk. parts: those
-    that were gone through since. stopping: whether it has been told to stop.
+    stopping: whether the server was told to stop. failure: why it cannot become ready. compiling: whether
+    kernels may be missing on the disk. parts: the parts of the kernels that this start has compiled.
     """
 
     ready: bool = False
@@ -55,7 +55,7 @@ class Startup:
     parts: list[str] = field(default_factory=list)
 
     def problem(self) -> SpecshieldError | None:
-        """Why the server should not be asked: it is not ready yet, or about to stop. None where it should."""
+        """Why requests should not come here: the server is not ready yet, or about to stop. Else None."""
         if self.stopping:
             return Stopping("the server is about to stop", expected="another server behind the same address")
         if self.ready:
@@ -75,16 +75,16 @@ class Startup:
 
 
 def on_disk() -> int:
-    """Of the kernels that a start needs, as many as there are: by this start, or by one before it."""
+    """How many of the kernels that a start needs are on the disk, by this start or an earlier one."""
     return min(compiled.on_disk(), KERNELS)
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
-    """Returns when the server is ready, or cannot become it.
+    """Returns when the server is ready, or cannot become ready.
 
-    check: blocks, and raises what keeps the server from serving; StoreError where that cannot be known yet.
+    check: raises what keeps the server from serving, or StoreError while that is not known. It blocks.
     """
-    gc.freeze()  # 300,000 objects that stay: looking at them makes a collection take 0.2 s
+    gc.freeze()  # excludes 300,000 permanent objects from collections, which would take 0.2 s with them
     gc.enable()
     try:
         mark = compiled.mark(READY)
@@ -95,12 +95,12 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
                 await _compile(startup, warmup.PARTS, mark, cores())
             finally:
                 telling.cancel()
-        for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
+        for part in warmup.PARTS:  # takes the kernels from the disk, and compiles those that are not there
             await asyncio.to_thread(warmup.warm_up, part)
-        gc.freeze()  # what the kernels brought stays too
+        gc.freeze()  # the objects of the kernels are permanent too
         gc.set_threshold(YOUNG, 10, 10)
         while True:
-            with contextlib.suppress(StoreError):  # /readyz says that it is away
+            with contextlib.suppress(StoreError):  # /readyz says that the store is away
                 await asyncio.to_thread(check)
                 break
             await asyncio.sleep(CHECK_EVERY)
@@ -117,8 +117,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 
 
 async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
-    """Once the server is ready, compiles what only some rules and robots need, in `at_once` processes. Their
-    first decision would else compile it, while all others wait. False where something was left out.
+    """Once the server is ready, compiles the kernels that only some rules and robots need, in `at_once`
+    processes. Else their first decision would compile them, while all others wait. False if some are missing.
     """
     while not startup.ready:
         await asyncio.sleep(CHECK_EVERY)
@@ -131,13 +131,13 @@ async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
         if mark.exists():
             return True
         log.warning("some kernels are not compiled: the first decision that needs one will wait for it")
-    except Exception as error:  # no room for a file or another process, say
+    except Exception as error:  # as when there is no room for a file or a process
         log.warning("the other kernels cannot be compiled now: %r", error)
     return False
 
 
 async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int, nice: int = 0) -> None:
-    """Compiles these parts, a process each, so many at once, and makes the mark once all are on the disk."""
+    """Compiles these parts, with a process for each and `at_once` at a time, and then makes the mark."""
     free = asyncio.Semaphore(at_once)
     async with _one_at_a_time(mark.with_suffix(".lock")):
         if mark.exists():  # another process has done it meanwhile
@@ -147,7 +147,7 @@ async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: 
 
 
 async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore, nice: int) -> bool:
-    """Whether the process that compiles this part came to its end."""
+    """Compiles a part in a process. False if that failed."""
     async with free:
         program = sys.executable, "-m", "specshield.service.warmup", part, str(nice)
         process = await asyncio.create_subprocess_exec(*program, stdin=asyncio.subprocess.PIPE)
@@ -174,7 +174,7 @@ async def _tell() -> None:
 
 @asynccontextmanager
 async def _one_at_a_time(path: Path) -> AsyncIterator[None]:
-    """Holds the lock of this file, which ends with the process that holds it."""
+    """Holds a lock on this file during the block. It would also end with this process."""
     with open(path, "ab", opener=private) as lock:
         while True:
             with contextlib.suppress(BlockingIOError):

@@ -1,4 +1,4 @@
-"""`specshield verify`: is a session's record whole, and would every step be decided like that again?"""
+"""`specshield verify`: checks that a session's record is complete, and makes every decision again."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from specshield.world.learned import LearnedMap
 
 
 def verify(file: Path, settings: Settings) -> int:
-    """Prints what is found of a record. 0: every step is as it should be; 1: it is not; 2: only the chain
-    could be checked; 4: a step differs, of a rule that another version decided. Raises InputError where the
-    file cannot be read.
+    """Checks a record and prints the result. Returns 0 if every step is right, 1 if something differs, 2 if
+    only the chain could be checked, 4 if a step differs that another version decided. Raises InputError if
+    the file cannot be read.
     """
     try:
         with open(file, "rb") as opened:
@@ -68,7 +68,9 @@ def verify(file: Path, settings: Settings) -> int:
 
 
 def _decide(found: Chain, shields: Sequence[Shield]) -> int:
-    """What another version decided shows in all that follows: a decision goes by those before it."""
+    """Makes all decisions again, and prints those that differ. Once another version has decided a step, its
+    effect is in all later ones, so that a difference there has a status of its own.
+    """
     others = [config for config in found.configs if config.version not in ("", __version__)]
 
     def told(t: int) -> tuple[str, int]:
@@ -92,7 +94,7 @@ def _decide(found: Chain, shields: Sequence[Shield]) -> int:
 
 
 def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, list[str]]]:
-    """The steps whose decision is another one now, each with the fields that differ. shields: one a rule."""
+    """The steps whose decision differs now, each with the fields that differ. shields: one for each rule."""
     configs, rule = [msgspec.to_builtins(config) for config in found.configs], 0
     carry = begun(way(configs[0]))
     maps, made = dict[bytes, LearnedMap](), dict[tuple[int, bytes], Made]()
@@ -111,7 +113,7 @@ def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, 
             shield = replace(shield, proposers=made[key].proposers)
         again, following = _again(found, shield, t, kept, carry)
         if record.encode(again) != content and shield.preference is not None:
-            # Where its preference was not at hand, the server projected.
+            # The server projects as long as the preference is not prepared.
             projected, other = _again(found, replace(shield, preference=None), t, kept, carry)
             if record.encode(projected) == content:
                 again, following = projected, other
@@ -138,8 +140,8 @@ def _again(
 
 
 def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[str]]]:
-    """As the server had them, one a rule; and `_unlike` of each. Raises SpecshieldError without one."""
-    with tempfile.TemporaryDirectory() as folder:  # where there is no data folder, none is made
+    """The shields that the server had, one for each rule, with `_unlike` of each. Raises SpecshieldError."""
+    with tempfile.TemporaryDirectory() as folder:  # so that no data folder is made if there is none
         if not settings.data_dir.is_dir():
             settings = settings.model_copy(update={"data_dir": Path(folder)})
         policies = Policies(settings, Maps(settings))
@@ -150,7 +152,7 @@ def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[
 
 
 def _shield(config: Config, pose: list[float], policies: Policies) -> tuple[Shield, list[str]]:
-    """pose: the first one that the rule looks at."""
+    """The shield of a rule, with `_unlike` of its config. pose: the pose at the rule's origin."""
     records = [policies.record(id) for id in config.policy_ids]
     proposers = [policies.policy(each) for each in records]
     shield = replace(make_shield(proposers), config=settings_of(msgspec.structs.asdict(config)))
@@ -161,7 +163,7 @@ def _shield(config: Config, pose: list[float], policies: Policies) -> tuple[Shie
 
 
 def _unlike(config: Config, asked: Mapping[str, Any]) -> list[str]:
-    """What this config says otherwise of the task than one that a server makes for the same policies."""
+    """The members of a config that differ from those that a server would store for the same policies."""
     said = msgspec.to_builtins(config)
     said, asked = {**said, **said["spec"]}, {**asked, **asked["spec"]}
     return [name for name in asked if name != "spec" and said[name] != asked[name]]

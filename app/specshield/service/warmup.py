@@ -1,10 +1,10 @@
-"""Compiles what a decision needs, on a world of a few cells, before the server says it is ready.
+"""Compiles the kernels that decisions need, on a world of a few cells, before the server is ready.
 
-    python -m specshield.service.warmup PART NICENESS    # compiles one part, for `startup`; the disk keeps it
+    python -m specshield.service.warmup PART NICENESS    # compiles one part onto the disk, for startup.py
 
-The parts have few kernels in common, so that two processes can compile them side by side. What only some
-rules and robots need is compiled once the server is ready, so that no decision of theirs waits for it. What a
-look-ahead session needs is compiled when the first of them is made.
+The parts have few kernels in common, so that processes can compile them at the same time. Kernels that only
+some rules and robots need are compiled once the server is ready, so that no decision has to wait for them.
+The kernels of look-ahead are compiled when the first session with it begins.
 """
 
 from __future__ import annotations
@@ -56,18 +56,18 @@ def warm_up(part: str) -> None:
 
 
 def _propose(task: Task) -> None:
-    """What reachability takes to make its tables and to propose. Nothing else takes as long to compile."""
+    """The kernels by which reachability makes its tables and proposes. They take longest to compile."""
     policy = synthesise(task)
     policy.propose(np.array([START]), {}, 0.0)
     body = make_body(task.robot, task.grid)
-    for guess in (False, True):  # the ways that are known do; a guess is searched for
+    for guess in (False, True):  # without a guess, known ways suffice; with one, ways are searched for
         policy.on_body(body, guess).propose(np.array([START]), {}, 0.0)
     distances(body, goal_cells(body, make_rules(task)))
 
 
 def _decide(task: Task) -> None:
-    """What the shield takes to begin a session, to decide and to refuse, with a DQN that proposes: in a world
-    that is as told, and by a session's defaults.
+    """The kernels by which the shield begins sessions, decides and refuses, with a DQN as the proposer: with
+    an exact world, and with the defaults of a session.
     """
     policy = Policy(task, {"id": "warm-up"}, _network(task))
     logits = np.zeros(len(STRETCH.actions))
@@ -84,8 +84,8 @@ def _decide(task: Task) -> None:
 
 
 def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
-    """What only a robot in trouble needs, so that no decision waits for a compiler then: walled in, where it
-    must not be, or stopped by something unknown. And what a threshold below 1 needs.
+    """The kernels for a robot in trouble: walled in, where it must not be, or stopped by something unknown.
+    And those for a threshold below 1.
     """
     shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
     first = episode.decide(shield, [START], logits)
@@ -102,7 +102,7 @@ def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
 
 
 def _decide_rarely(task: Task) -> None:
-    """What late robots, narrow places, robots that only go ahead, and reasons in words take."""
+    """The kernels for late robots, narrow places, robots that only go ahead, and explanations."""
     ahead = replace(task.robot, actions=tuple(each for each in task.robot.actions if each.translate >= 0.0))
     for each in (
         task,
@@ -117,7 +117,7 @@ def _decide_rarely(task: Task) -> None:
 
 
 def _plan(task: Task) -> None:
-    """What a planner takes."""
+    """The kernels of the planner."""
     from specshield.policy.planner import policy as planner
 
     planner.synthesise(task).propose(np.array([START]), {}, 0.0)
@@ -128,7 +128,7 @@ LATER: dict[str, Callable[[Task], None]] = {"rarer decisions": _decide_rarely, "
 
 
 def _task(**regions: dict[str, Any]) -> Task:
-    """A task in which every cell can be reached: for others scipy is imported, which takes 0.2 s."""
+    """A task in which every cell can be reached: other tasks import scipy, which takes 0.2 s."""
     small, empty = replace(STRETCH, radius=0.01), OccupancyGrid(np.zeros((20, 20), bool), 0.1)
     return make_task(empty, small, FORMULA, {**REGIONS, **regions})
 
@@ -141,7 +141,7 @@ def _network(task: Task) -> Network:
 
 
 def _keep_all() -> None:
-    """From now on a kernel that the disk does not take ends this process: it compiles for the disk alone."""
+    """From now on this process ends if a kernel cannot be written to the disk: it compiles only for that."""
     files: Any = IndexDataCacheFile
     save = files.save
 

@@ -1,4 +1,4 @@
-"""Many episodes of a case, each start once with the shield and once without, several robots at a time."""
+"""Runs many episodes of a case, from each start once with and once without the shield, several at a time."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
 
 T = TypeVar("T")
-PATIENCE = 60.0  # [s] for one decision: other work may share the machine
-MOST_ROBOTS = 8  # processes at once, of 190 MB each; chosen by hand
-DRAWS = 100  # starts tried for one episode before giving up
+PATIENCE = 60.0  # [s] for one decision: the machine may be busy
+MOST_ROBOTS = 8  # processes at once, with 190 MB each; chosen by hand
+DRAWS = 100  # starts that are tried for one episode
 
 
 class Campaign(NamedTuple):
-    """Episodes in pairs: `shielded[i]` and `unshielded[i]` share their start and the model's seed.
+    """Pairs of episodes: `shielded[i]` and `unshielded[i]` have the same start and the same seed of the
+    model.
 
-    refused: how many starts the service refused as infeasible before it took those of the episodes.
+    refused: the number of starts that the service refused as infeasible.
     """
 
     case: Case
@@ -43,21 +44,21 @@ class Campaign(NamedTuple):
 
     @property
     def broken(self) -> list[Episode]:
-        """The shielded episodes that did not satisfy the rule: none, by the shield's promise."""
+        """The shielded episodes that did not satisfy the rule; the shield promises that there are none."""
         return [episode for episode in self.shielded if episode.spec_status != "satisfied"]
 
 
 @contextmanager
 def robots(url: str) -> Iterator[Executor]:
-    """Processes that drive robots, through clients of the service at `url`: the models of several robots
-    would wait for each other in one. There is one more than there are cores, since each waits for the service
-    now and then. What has not begun by the end of the block is called off.
+    """Processes that drive robots with clients of the service at `url`: in a single one, the models of
+    several robots would wait for each other. There is one process more than there are cores, since each waits
+    for the service now and then. Calls that have not begun at the end of the block are cancelled.
     """
     pool = ProcessPoolExecutor(min(cores() + 1, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
     try:
         yield pool
     finally:
-        pool.shutdown(cancel_futures=True)  # those that drive come to their end
+        pool.shutdown(cancel_futures=True)  # waits for the episodes that have begun
 
 
 def run(
@@ -68,11 +69,11 @@ def run(
     on_progress: Callable[[int], None] = lambda _: None,
     named: bool = False,
 ) -> Campaign:
-    """`runs` pairs of episodes of a case, the i-th decided by `seed` and i alone. on_progress: how many are
-    done.
+    """Runs pairs of episodes of a case; `seed` and i alone determine pair i. on_progress: called with the
+    number of pairs that are done.
 
-    named: whether the sessions' ids say what they are, such as `case1-0-shielded` and `case1-0-alone`: for a
-    server that has no others.
+    named: whether the sessions get ids such as `case1-0-shielded` and `case1-0-alone`, for a server without
+    other sessions.
     """
     pairs = dict[int, tuple[Episode, Episode, int]]()
     for i, pair in each_done(robots.submit(_pair, case, i, seed, named) for i in range(runs)):
@@ -83,11 +84,11 @@ def run(
 
 
 def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:
-    """The number of each future and its result, as they come.
+    """The number and the result of each future, in the order in which they are done.
 
-    An interrupt that comes while the futures are made or waited for is raised afterwards. Raised at once, it
-    could leave one of the pool's locks held, and the program would wait for that for ever at its end. The
-    processes that the pool starts meanwhile never see an interrupt: the parent ends them.
+    An interrupt (Ctrl-C) while the futures are made or waited for is raised afterwards. Raised at once, it
+    could leave a lock of the pool held, for which the program would wait for ever at its end. The processes
+    that the pool starts meanwhile ignore interrupts: the parent ends them.
     """
     done: SimpleQueue[Future[T] | None] = SimpleQueue()  # None: an interrupt came
     number = dict[Future[T], int]()
@@ -120,7 +121,7 @@ def _interrupts_into(done: SimpleQueue[Any]) -> Iterator[None]:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-_client: ShieldClient | None = None  # of a process that drives robots
+_client: ShieldClient | None = None  # the client of a process that drives robots
 _case = cache(load_case)
 
 
@@ -147,8 +148,8 @@ def _pair(name: str, i: int, seed: int, named: bool) -> tuple[Episode, Episode, 
 
 
 def begin(client: ShieldClient, case: Case, policy: str, seed: int, **more: Any) -> tuple[Session, Pose, int]:
-    """A session at the first start that is not refused, of those drawn uniformly over free space; that start;
-    and how many were refused. more: options of the session.
+    """Draws starts uniformly over free space until one is not refused. Returns its session, that start, and
+    the number of refused ones. more: options of the session.
     """
     starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):

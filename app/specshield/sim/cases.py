@@ -1,4 +1,4 @@
-"""The paper's cases, read from maps/: the apartment, its rule, and what the robot is sent to find."""
+"""The paper's cases, which are read from maps/: the apartment, the rule, and what the robot has to find."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from specshield.world.regions import Region, region_from_json
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A task, its spec as written, and the instruction; target: where what it names is, (x, y) [m]."""
+    """A task, its spec as JSON, and the model's instruction. target: where its object is, (x, y) [m]."""
 
     name: str
     task: Task
@@ -46,7 +46,7 @@ class Case:
         return geodesic_distance(~grid.occupied, goal, grid.resolution)
 
     def cell(self, point: Sequence[float]) -> tuple[int, int]:
-        """Row and column of the cell that (x, y) lies in."""
+        """Row and column of the cell in which (x, y) lies."""
         column, row = np.floor(self.task.grid.to_grid(point[:2]) / self.task.grid.resolution).astype(int)
         return int(row), int(column)
 
@@ -56,12 +56,12 @@ def case_names(folder: Path = MAPS) -> list[str]:
 
 
 def case_name(said: str) -> str:
-    """Of a case that may be called by its number: 1 is case1, 2b is case2b."""
+    """The name of a case for its number or its name: 1 is case1, 2b is case2b."""
     return f"case{said}" if said[:1].isdigit() else said
 
 
 def variants(folder: Path = MAPS) -> dict[str, str]:
-    """Cases that differ from one of `case_names` in their rule alone, each with the name of that one."""
+    """Cases that differ from one of `case_names` only in the rule, each with the name of that case."""
     return {
         variant: name
         for name in case_names(folder)
@@ -70,7 +70,7 @@ def variants(folder: Path = MAPS) -> dict[str, str]:
 
 
 def load_case(name: str, folder: Path = MAPS) -> Case:
-    """The case of that name or number, such as case2 or 2b, in `folder`. Raises NotFound."""
+    """The case of this name or number, such as case2 or 2b. Raises NotFound."""
     asked, others = case_name(name), variants(folder)
     name, names = others.get(asked, asked), [*case_names(folder), *others]
     if name not in names:

@@ -1,4 +1,4 @@
-"""What `specshield demo` does: both cases over HTTP, a table of what came of them, and a picture of each."""
+"""`specshield demo`: runs both cases over HTTP, prints a table of results, and draws a picture of each."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from specshield.sim.service import own_server
 def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     """Runs every case with and without the shield, and writes the pictures into the folder `out`.
 
-    stay: whether the service stays up, with its page, until it is interrupted. Returns the exit status: 1 if
+    stay: whether the service and its page stay up until an interrupt (Ctrl-C). Returns the exit status: 1 if
     an episode with the shield broke its rule.
     """
     began, status = time.monotonic(), StatusLine()
@@ -32,7 +32,7 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
             for name in case_names():
                 campaigns.append(_campaign(several, name, runs, seed, status))
                 first = campaigns[-1].shielded[0], campaigns[-1].unshielded[0]
-                # In one of the processes, while the others go on with the next case.
+                # One of the processes draws while the others go on with the next case.
                 pictures.append(several.submit(picture.draw, load_case(name), *first, out / f"{name}.svg"))
             for drawn in pictures:
                 drawn.result()

@@ -1,4 +1,4 @@
-"""One episode of a simulated robot with a model, driven through the SDK: with the shield, and without it."""
+"""Drives one episode of a simulated robot with a model through the SDK, with the shield or without it."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MAX_STEPS = 600
 
 @dataclass
 class Episode:
-    """What happened in one episode; filled in while it runs.
+    """What happened in one episode; it is filled in while the episode runs.
 
-    spec_status, robustness: the service's verdict on the poses; (lo, hi) [m], None where unbounded.
-    main_done: the model ended within 1 m of its target before MAX_STEPS. ended_at: the step of its `end`,
-    None if never. modes: decisions by mode. asked: decisions made while the rule was pending and the main
-    task ran; spread: how many of them were `shaped` and left the model more than one action. kl: of each
-    decision from the model's own distribution [nats]. round_trip_ms, server_ms: of each decision.
-    poses: x_0 ... x_t. session: the id of the session that holds them.
+    spec_status, robustness: the service's verdict on the poses, and its bounds (lo, hi) [m], None if
+    unbounded. main_done: whether the model ended within 1 m of its target before MAX_STEPS. ended_at: the
+    step of its `end`, None if never. modes: the number of decisions by mode. asked: the number of decisions
+    while the rule was pending and the main task ran; spread: those of them that were `shaped` and left more
+    than one action. kl: the distance of each decision from the model's distribution [nats]. round_trip_ms,
+    server_ms: times of each decision. poses: x_0 ... x_t. session: the id of the session with these poses.
     """
 
     case: str
@@ -66,7 +66,9 @@ class Episode:
 
 
 def with_shield(session: Session, case: Case, model: FoundationModel, start: Pose, seed: int) -> Episode:
-    """The model proposes, the service decides, the robot executes; `session` has just begun at `start`."""
+    """Drives with the shield: the model proposes, the service decides, the robot executes. `session` has just
+    begun at `start`.
+    """
     episode, robot = Episode(case.name, seed, start), SimulatedRobot(case, start)
     episode.session = session.id
     model.reset(np.random.default_rng([seed, 0]))
@@ -94,12 +96,10 @@ def without_shield(
     policy_id: str | None = None,
     id: str | None = None,
 ) -> Episode:
-    """The model's own draws, executed; after its `end` the robot stands still until the rule is decided.
+    """Drives without the shield: the robot executes the model's own draws; after `end` it stands still until
+    the rule is decided. The service gives the verdict: the poses are recorded in a session without decisions.
 
-    policy_id: of a policy for the case's rule; the one that came with the case where none is given. id: of
-    the session.
-
-    The verdict is the service's: the poses are recorded into a session that decides nothing.
+    policy_id: a policy for the case's rule, by default the one that came with the case. id: of the session.
     """
     episode, robot = Episode(case.name, seed, start), SimulatedRobot(case, start)
     model.reset(np.random.default_rng([seed, 0]))

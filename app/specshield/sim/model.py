@@ -1,4 +1,4 @@
-"""The foundation model as the simulation sees it, and a simple stand-in for one, which knows no rule."""
+"""The interface of foundation models in the simulation, and a simple stand-in, which knows no rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from specshield.sim.robot import Observation, SimulatedRobot
 
 
 class FoundationModel(Protocol):
-    """A policy with a memory of its own: it takes what the robot senses and gives logits."""
+    """A model with a memory: it takes what the robot senses and returns logits."""
 
     def reset(self, random: np.random.Generator) -> None:
         """Forgets the last episode. All randomness of the next one comes from `random`."""
@@ -25,20 +25,20 @@ class FoundationModel(Protocol):
 
 
 class GoalSeeker:
-    """Prefers what brings it nearer to its target, hesitates, and ends near the target.
+    """Prefers actions that bring it nearer to its target, hesitates, and ends near the target.
 
     A logit is the number of steps that an action saves, times SHARPNESS, plus noise that drifts from step to
-    step (as a learned model's errors do) and a preference for the action executed last. The constants were
+    step (as a learned model's errors do) and a preference for the last executed action. The constants were
     chosen by hand, so that the entropy of its distributions is 0.5 to 2 nats (tests/sim/test_model.py).
     """
 
-    SHARPNESS = 2.5  # logits a step saved
+    SHARPNESS = 2.5  # logits for each saved step
     NOISE = 0.6  # logits, standard deviation
-    DRIFT = 0.5  # share of the noise that stays from one step to the next
-    HABIT = 0.5  # logits for the action executed last
-    IDLE = -4.0  # logits for tokens that leave the base where it is
-    END_WITHIN = 0.7  # [m] of the target
-    END_NEAR, END_FAR, END_SLOPE = 2.5, -9.0, 30.0  # logits of `end`, and logits a metre between them
+    DRIFT = 0.5  # share of the noise that remains from one step to the next
+    HABIT = 0.5  # logits for the last executed action
+    IDLE = -4.0  # logits for tokens that do not move the base
+    END_WITHIN = 0.7  # [m] from the target
+    END_NEAR, END_FAR, END_SLOPE = 2.5, -9.0, 30.0  # logits of `end`, and their slope in between [1/m]
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -67,12 +67,12 @@ class GoalSeeker:
         return logits
 
     def _shake(self, kept: float) -> None:
-        """The noise of the next step, of which the share `kept` is that of the last; its variance stays 1."""
+        """Makes the noise of the next step: the share `kept` of it is the last noise, and its variance 1."""
         fresh = self._random.normal(size=len(self._noise))
         self._noise = kept * self._noise + math.sqrt(1.0 - kept**2) * fresh
 
     def _saved(self, observation: Observation) -> Floats:
-        """The steps that each action saves, shape (A,): one for a stride nearer, or for the largest turn."""
+        """The steps that each action saves, shape (A,): 1 for a stride or the largest turn to the target."""
         bearing = observation.bearing
         nearer = self._translate / self._stride * math.cos(bearing)
         after = np.abs(np.remainder(bearing - self._rotate + math.pi, 2.0 * math.pi) - math.pi)

@@ -1,4 +1,4 @@
-"""The demo's picture of a case: the floor, the named regions, and two ways from one start."""
+"""The demo's picture of a case: the floor, the named regions, and the two ways from one start."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from specshield.world.regions import signed_distance
 
 
 def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None:
-    """Writes an SVG, and the folder that it is in."""
-    asked = case.task.horizon + 1  # states that the rule is about
+    """Writes the picture as SVG, and makes its folder."""
+    asked = case.task.horizon + 1  # the number of states that the rule is about
     plan = Plan(case.task, f"{case.name} with and without the shield")
     plan.walls()
     _rooms(plan, case)
@@ -32,7 +32,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
         plan.way(poses[asked - 1 :], "after")
         plan.way(poses[:asked], kind)
     for n, (t, pose) in enumerate(_visits(case, shielded.poses)):
-        plan.mark(pose, f"t={t}", above=n % 2 == 0)  # two may meet
+        plan.mark(pose, f"t={t}", above=n % 2 == 0)  # above and below in turn, since two may meet
     plan.robot(shielded.start)
     sought = case.instruction.split()[-1]
     plan.mark(case.target, sought if sought.isalpha() else "target", "target")
@@ -42,7 +42,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
 
 
 def _rooms(plan: Plan, case: Case) -> None:
-    """The names of rooms that are no regions of the rule, where no region and no target takes the space."""
+    """Writes the names of rooms that are no regions of the rule, away from regions and the target."""
     grid = case.task.grid
     taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
     taken.append(np.hypot(*np.moveaxis(grid.centres - case.target, -1, 0)) < 0.8)
@@ -54,7 +54,7 @@ def _rooms(plan: Plan, case: Case) -> None:
 
 
 def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
-    """Each visit that the rule asks for: the first step in its window that makes it, and the pose there."""
+    """For each visit that the rule asks for, the first step in its window that makes it, and its pose."""
     for part in obligations(case.task.formula):
         if part.kind != "eventually":
             continue
@@ -67,7 +67,7 @@ def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
 
 
 def _legend(plan: Plan, case: Case, shielded: Episode, unshielded: Episode) -> None:
-    """Below the map: what each colour is."""
+    """Writes below the map what each colour means."""
 
     def outcome(episode: Episode) -> str:
         found = f"ended at t={episode.ended_at}" if episode.main_done else "target not found"

@@ -1,4 +1,4 @@
-"""How far a command is, on standard error."""
+"""Shows the progress of a command on standard error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ EVERY = 10.0  # [s] between lines where standard error is no terminal
 
 
 class StatusLine:
-    """One line that is written over on a terminal; elsewhere a new line every EVERY seconds at most."""
+    """One line that is overwritten on a terminal; elsewhere new lines, at most one in EVERY seconds."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()

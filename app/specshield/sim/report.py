@@ -14,7 +14,7 @@ MODES = ("shaped", "completion", "prior", "fallback", "violated")
 
 
 def table(campaigns: Sequence[Campaign]) -> str:
-    """One pair of columns a case: without the shield, and with it."""
+    """The table, with two columns for each case: without and with the shield."""
     columns = [column for each in campaigns for column in (_outcome(each.unshielded), _shielded(each))]
     names = list(columns[1])
     cells = [[name, *(column.get(name, "") for column in columns)] for name in names]
@@ -33,12 +33,12 @@ def _outcome(episodes: Sequence[Episode]) -> dict[str, str]:
 
 
 def _shielded(campaign: Campaign) -> dict[str, str]:
-    """What is told of the episodes with the shield.
+    """The column of the episodes with the shield.
 
-    KL: of the decisions made for the model from its own distribution [nats], a decision and summed over an
-    episode. Extra steps: how much later the model ended than without the shield, where it did its task both
-    times. More than one action left: of the decisions made while the rule was pending and the main task ran,
-    the share that was `shaped` and left the model a choice.
+    KL: the distance of the decisions from the model's distribution [nats], per decision and summed over an
+    episode. Extra steps: how much later the model ended than without the shield, if it did its task both
+    times. More than one action left: the share of decisions that were `shaped` and left the model a choice,
+    among those while the rule was pending and the main task ran.
     """
     shielded = campaign.shielded
     modes = sum((episode.modes for episode in shielded), Counter[str]())

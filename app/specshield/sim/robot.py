@@ -1,4 +1,4 @@
-"""A simulated robot: it executes actions exactly as the known dynamics say, and senses its way."""
+"""A simulated robot: it moves exactly by the known dynamics, and senses its surroundings."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from specshield.robot.dynamics import displacements, step, successors
 from specshield.sim.cases import Case
 from specshield.sim.senses import RAYS, Senses, scan, see
 
-COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
-LOOK_AHEAD = 10  # [cells] along the way: how far ahead the bearing is taken; chosen by hand
-NEAR = 1.0  # [m] along free space: an `end` within this has found the target
+COMFORT = 0.32  # [m] clearance with which a Stretch can turn about its origin
+LOOK_AHEAD = 10  # [cells] along the way, to the point whose bearing is sensed; chosen by hand
+NEAR = 1.0  # [m] along free space within which an `end` has found the target
 
 Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What the robot senses of where it is: egocentric, no pose, no map.
+    """What the robot senses, without pose and map.
 
     distance: to the target along free space [m]. bearing: of the way there, from the heading [rad].
-    blocked (A,): actions that something would stop short. last_action: the one executed last, None at first.
+    blocked (A,): actions that something would stop. last_action: the last executed one, None at first.
     """
 
     distance: float
@@ -36,7 +36,7 @@ class Observation:
 
 
 class SimulatedRobot:
-    """pose: (x, y, theta) in metres and radians, map frame. last_action: the one executed last."""
+    """pose: (x, y, theta) [m, m, rad], map frame. last_action: the last executed one, None at first."""
 
     def __init__(self, case: Case, pose: Pose) -> None:
         self._case = case
@@ -44,7 +44,7 @@ class SimulatedRobot:
         self.last_action: int | None = None
 
     def execute(self, action: int) -> None:
-        """One action, an index into the robot's; a terminal one moves nothing."""
+        """Executes the action of this index; a terminal one moves nothing."""
         motion = self._case.task.robot.motion_of[action]
         if motion >= 0:
             self.pose = step(self._case.body, *self.pose, motion)
@@ -59,7 +59,7 @@ class SimulatedRobot:
         return Observation(distance, bearing, self._blocked(), self.last_action)
 
     def sense(self) -> Senses:
-        """What a robot without a map has: its scanner, its camera, and what it did."""
+        """What a robot without a map senses: its scanner, its camera, and the last action."""
         ranges = np.empty(RAYS)
         scan(self._case.body, *self.pose, ranges)
         return Senses(ranges, *see(self._case.body, *self.pose, *self._case.target), self.last_action)
@@ -75,9 +75,8 @@ class SimulatedRobot:
 
 
 def way(case: Case, pose: Pose) -> tuple[float, float]:
-    """How far the case's target is along free space [m], and in which direction the way begins.
-
-    The direction is the bearing of the way from the robot's heading, in [-pi, pi].
+    """The distance to the case's target along free space [m], and the bearing of the way there from the
+    robot's heading, in [-pi, pi].
     """
     cell, (x, y, theta) = case.cell(pose), pose
     ahead = waypoints(case)[cell] - (x, y)
@@ -87,17 +86,17 @@ def way(case: Case, pose: Pose) -> tuple[float, float]:
 
 @lru_cache(maxsize=32)
 def waypoints(case: Case) -> Floats:
-    """From each cell, the point that lies LOOK_AHEAD cells on along the way to the target [m].
+    """For each cell, the point LOOK_AHEAD cells further along the way to the target [m], [height, width, 2].
 
-    The way keeps off the walls, so that the robot can turn on it; from a cell beside a wall it first leads
-    away from the wall. Shape [height, width, 2].
+    The way keeps away from the walls, so that the robot can turn on it; from a cell beside a wall it first
+    leads away from the wall.
     """
     grid = case.task.grid
     free, comfortable = ~grid.occupied, grid.clearance > COMFORT
     goal = np.zeros_like(free)
     goal[case.cell(case.target)] = True
-    onward = geodesic_distance(comfortable | goal, goal, grid.resolution)  # it may stand beside a wall
-    if not np.isfinite(onward[comfortable]).any():  # or where it is narrow all around
+    onward = geodesic_distance(comfortable | goal, goal, grid.resolution)  # the target may be beside a wall
+    if not np.isfinite(onward[comfortable]).any():  # or in a narrow place
         narrow = free & (case.distance <= case.distance[comfortable].min(initial=np.inf))
         onward = geodesic_distance(comfortable | narrow, goal, grid.resolution)
     off = geodesic_distance(free, np.isfinite(onward), grid.resolution)

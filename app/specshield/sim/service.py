@@ -1,4 +1,4 @@
-"""A specshield server of one's own, for as long as a block lasts."""
+"""Starts a specshield server for the duration of a block."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def own_server(
     key: str | None = None,
     complete: bool = True,
 ) -> Iterator[str]:
-    """Starts `specshield serve` on a free port, its data in `data`, else in a temporary folder; yields its
-    address.
+    """Starts `specshield serve` on a free port and yields its address. data: the data folder, by default a
+    temporary one.
 
-    worker: whether it makes policies too. say: is told how far the server is while it starts. key: one that
-    it takes beside those that `data` holds. complete: whether it compiles, once ready, what only some rules
-    and robots need, which slows all else for a while. Raises ServerError with the server's log where it does
-    not come up.
+    worker: whether it makes policies too. say: called with the progress of the server's start. key: a key
+    that it takes beside those in `data`. complete: whether it compiles, once ready, the kernels that only
+    some rules and robots need, which slows the rest for a while. Raises ServerError with the server's log if
+    it does not become ready.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
@@ -61,13 +61,13 @@ def own_server(
 
 
 def follow_parent() -> None:
-    """Linux: a process that calls this as it begins is told to stop if the one that started it is killed."""
+    """On Linux, this process gets SIGTERM once the process that started it has ended, even by a kill."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _environment(data: Path, worker: bool, key: str | None, complete: bool) -> dict[str, str]:
-    """This process's, without what would join the server to another's store or lock it."""
+    """The server's environment: this process's, without settings of another store or another key."""
     shipped = ("SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR")
     kept = {
         name: value
@@ -81,7 +81,7 @@ def _environment(data: Path, worker: bool, key: str | None, complete: bool) -> d
 def _wait_until_ready(
     url: str, server: subprocess.Popen[bytes], log: Path, say: Callable[[str], object]
 ) -> None:
-    """However long the server takes, unless it ends or says that it cannot become ready."""
+    """Waits until the server is ready. Raises ServerError if it ends or cannot become ready."""
     status = 0
     while server.poll() is None and status != 500:
         try:

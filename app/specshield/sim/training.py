@@ -1,4 +1,4 @@
-"""What `specshield train` does: a policy for a case, written where a server finds it."""
+"""`specshield train`: makes a policy for a case, and writes it where a server finds it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def train(
     out: Path | None,
     resume: bool,
 ) -> None:
-    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`; by default to a folder of
-    models/, unless that holds a policy.
+    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`, by default a folder of
+    models/ that has no policy yet.
 
-    options: "name=value", of the method's options. A method that saves how far it is does so in
-    `out`/checkpoint; `resume` goes on from there after a kill.
+    options: "name=value" for options of the method. A method may save checkpoints in `out`/checkpoint, from
+    which `resume` goes on after a kill.
     """
     began, made_by, loaded = time.monotonic(), METHODS.get(method), load_case(case)
     given = _parse(options) | ({} if updates is None else {"updates": updates})
@@ -61,7 +61,7 @@ def train(
 
 
 def _parse(texts: Sequence[str]) -> dict[str, Any]:
-    """The options that "name=value" texts name, each value read as JSON or else as the text it is."""
+    """The options in texts "name=value", each value read as JSON, or else as text."""
     found: dict[str, Any] = {}
     for text in texts:
         name, _, value = text.partition("=")

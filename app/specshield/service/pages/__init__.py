@@ -1,6 +1,6 @@
-"""The page at `/`: files that go to a browser as they are, from memory.
+"""The page at `/`: files that are sent to browsers from memory.
 
-They hold nothing of anybody's, so that they need no key; what they show they ask of the API, as any caller.
+They hold no data of any owner, so they need no key. The page asks the API for what it shows, like any caller.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from specshield.errors import NotFound
 router = APIRouter(include_in_schema=False)
 FOLDER = Path(__file__).parent / "static"
 TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
-POLICY = (  # nothing from elsewhere, no script or style in the page itself, and no frame around it
+POLICY = (  # no content from elsewhere, no scripts or styles in the HTML, and no frame around the page
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
@@ -26,13 +26,13 @@ HEADERS = {
     "Content-Security-Policy": POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-cache",  # kept, and asked for by its tag: a new version shows at once
+    "Cache-Control": "no-cache",  # browsers keep a file but ask for its tag, so a new version shows at once
     "Vary": "Accept-Encoding",
 }
 
 
 class File(NamedTuple):
-    """packed: gzip of the content. tag: what a browser shows to hear that it has it already."""
+    """packed: gzip of the content. tag: the ETag, which a browser sends to ask for changes."""
 
     kind: str
     content: bytes
@@ -42,7 +42,7 @@ class File(NamedTuple):
 
 @cache
 def files() -> dict[str, File]:
-    """By path below `static`; 60 kB, read at the first request."""
+    """The files by their path below `static`: 60 kB that are read at the first request."""
     found = {}
     for path in sorted(FOLDER.rglob("*")):
         if path.suffix in TYPES:

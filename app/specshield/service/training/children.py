@@ -1,4 +1,4 @@
-"""What a server process keeps running beside it: its share of the embedded store, and a training worker."""
+"""What a server process keeps running beside itself: the embedded store, and a training worker."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from specshield.service.startup import Startup
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import private
 
-CHECK_EVERY = 0.25  # seconds
+CHECK_EVERY = 0.25  # [s] between two looks whether they still run
 log = logging.getLogger("specshield")
 
 
 class TrainingWorker:
-    """There is at most one for a data folder, however many servers share it: it holds a lock while it lives.
-
-    The worker of a server that dies ends by itself.
+    """The worker of a data folder. There is at most one, however many servers share the folder: it holds a
+    lock as long as it runs. It ends with the server that started it.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -33,7 +32,7 @@ class TrainingWorker:
 
     @property
     def methods(self) -> list[str]:
-        """What this server's worker offers. Once one has died, the store says what the next one offers."""
+        """The methods of the worker that this server has started. Those of a later one are in the store."""
         return self._methods if self._alive else []
 
     @property
@@ -41,7 +40,7 @@ class TrainingWorker:
         return self._process is not None and self._process.poll() is None
 
     def ensure(self) -> None:
-        """Start the worker, unless it runs already: as this process's child or as another server's."""
+        """Starts the worker, unless this server or another one has started it already."""
         if self._alive:
             return
         self._settings.data_dir.mkdir(parents=True, exist_ok=True)
@@ -49,7 +48,7 @@ class TrainingWorker:
         with open(path, "ab", opener=private) as lock, contextlib.suppress(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._methods = available() if self._process is None else []
-            # It ends when this process does: its standard input is a pipe from here.
+            # It ends with this process: its standard input is a pipe from here.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
                 env=self._settings.environment(),
@@ -66,7 +65,7 @@ class TrainingWorker:
 
 
 async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None, startup: Startup) -> None:
-    """Starts again what has died: the store, and once the server is ready the worker. Until cancelled."""
+    """Until it is cancelled, starts the store again if it died, and the worker once the server is ready."""
     while True:
         try:
             if embedded is not None and not embedded.joined():

@@ -1,7 +1,8 @@
-"""Training runs: queued with rq, followed in `specshield:training:{id}`. Blocking.
+"""The runs that make policies: queued with rq, with their state in `specshield:training:{id}`.
 
-A run writes there only while its `attempt`, the name of its job, is the latest, so cancelling or asking
-again is one write. A run that stops giving signs of life, or left the queue and gave none, has failed.
+A run writes its state only while its `attempt`, the name of its job, is the latest one, so that cancelling
+and asking again are one write each. A run counts as failed if it gives no more signs of life, or if it has
+left the queue and never gave one.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from specshield.service.settings import Settings
 from specshield.service.storage.connect import connect, reaching
 from specshield.service.watch import logs
 
-ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
-AGAIN = "ask for it again: what learns goes on from its last checkpoint"
-SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
+ENDED = "specshield:jobs:ended"  # a hash from "method state" to the number of runs
+AGAIN = "ask for it again: a method that learns goes on from its last checkpoint"
+SIGN_OF_LIFE = 5  # [s] without a sign of life after which a run, or the last worker, counts as dead
 WRITE = """
 local attempt, status, method = unpack(redis.call('HMGET', KEYS[1], 'attempt', 'status', 'method'))
 if attempt ~= ARGV[1] or status == 'ready' or status == 'failed' then return '' end
@@ -36,33 +37,33 @@ return method
 
 @dataclass(frozen=True)
 class Training:
-    """How a run stands. eta_s: estimate of the time left [s]. error: why it failed, or what it waits for."""
+    """The state of a run. eta_s: estimate of the time left [s]. error: why it failed, or why it waits."""
 
-    status: str  # queued, training or failed
+    status: str  # queued, training, ready or failed
     progress: float = 0.0
     eta_s: float | None = None
     error: str | None = None
 
 
 class Jobs:
-    """Every method raises StoreError where the store cannot be reached in time."""
+    """Every method raises StoreError if the store cannot be reached in time."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
     @cached_property
     def redis(self) -> Any:
-        """Opened when it is first asked: a cluster is asked at once for its nodes, and may be away."""
+        """The store's client, opened at the first use, since a cluster may be away and is asked at once."""
         return connect(self._settings.store_url, blocking=True, socket_timeout=self._settings.store_timeout)
 
     def worker_there(self, method: str) -> bool:
         return bool(reached(lambda: self.redis.exists(_worker(method))))
 
     def start(self, id: str, method: str) -> None:
-        """Queue a run for this policy."""
+        """Queues a run for this policy."""
         attempt = secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
-        self.sign_of_life(id, attempt)  # for as long as it is noted and not in the queue yet
+        self.sign_of_life(id, attempt)  # for the moment in which the state is written and the queue is not
         with reaching():
             self.redis.hset(_key(id), mapping={**state, "method": method})
             self._enqueue(id, attempt, method)
@@ -85,20 +86,20 @@ class Jobs:
         return Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
 
     def get(self, id: str) -> Training:
-        """How the training of a policy stands. One that the store knows nothing of counts as failed."""
+        """The state of a policy's latest run. A policy without one in the store counts as failed."""
         found, alive = reached(lambda: (self.redis.hgetall(_key(id)), self.redis.exists(_alive(id))))
         state = {name.decode(): value.decode() for name, value in found.items()}
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
-            error = "the store knows nothing of its training any more; ask for it again"
+            error = "the store has lost the state of its training; ask for it again"
         if status == "queued" and not alive and not self._waits(state):
-            self.sign_of_life(id, state["attempt"])  # a worker has it, which may be dead: so it has this long
+            self.sign_of_life(id, state["attempt"])  # a worker has it; if that has died, this ends soon
             self.report(id, state["attempt"], status="training")
             status = "training"
         elif status == "training" and not alive:
             status, error = "failed", f"its worker is gone; {AGAIN}"
         if status == "queued" and not self.worker_there(state["method"]):
-            error = "it waits for a worker that makes such policies: none is running"
+            error = "it waits for a worker that makes policies by this method: none is running"
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
@@ -107,7 +108,7 @@ class Jobs:
         return reached(lambda: self.redis.lpos(key, state["attempt"])) is not None
 
     def cancel(self, id: str) -> None:
-        """Cancels the run. One that has begun is ended within about a second, a queued one at its turn."""
+        """Cancels a run. One that has begun ends within about a second, a queued one when it begins."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
         reached(lambda: self.redis.hset(_key(id), mapping=fields))
         logs.tell("policy cancelled", policy_id=id)
@@ -116,7 +117,7 @@ class Jobs:
         reached(lambda: self.redis.unlink(_key(id)))
 
     def counts(self) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], int]]:
-        """By method and state: the runs that are queued or training now, and all that have ended."""
+        """The numbers of runs by method and state: those queued or training now, and those that ended."""
         methods = METHODS.names()
         with reaching(), self.redis.pipeline(transaction=False) as pipe:
             for name in methods:
@@ -130,47 +131,47 @@ class Jobs:
         return dict(zip(live, now, strict=True)), told
 
     def hand_back(self, id: str, attempt: str) -> None:
-        """Queue a run whose worker stops before all others, unless it was cancelled or asked for again."""
+        """Puts a run whose worker stops at the front of the queue, unless another attempt has replaced it."""
         again = secrets.token_hex(8)
         if method := self.report(id, attempt, attempt=again, status="queued", eta_s=""):
             reached(lambda: self._enqueue(id, again, method, at_front=True))
 
     def end(self, id: str, attempt: str, error: str | None) -> None:
-        """Notes that a run made its policy, or why it did not; of no effect once it was cancelled."""
+        """Notes that a run made its policy, or the error why it did not. A cancelled run notes nothing."""
         told: dict[str, Any] = {} if error is None else {"error": error}
         state, said = ("ready", "policy made") if error is None else ("failed", "policy not made")
         if method := self.report(id, attempt, status=state, eta_s="", **(told or {"progress": 1})):
-            with suppress(StoreError):  # a count that is lost is no reason to fail
+            with suppress(StoreError):  # losing this count is no reason to fail
                 reached(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
             logs.tell(said, policy_id=id, method=method, **told)
 
     # --- for the run itself
 
     def report(self, id: str, attempt: str, /, **fields: Any) -> str:
-        """Notes how the run stands and gives its method, or does nothing and gives "" once cancelled."""
+        """Writes fields of the run's state and returns its method. For a cancelled run, only returns ""."""
         pairs = [part for pair in fields.items() for part in pair]
         method: bytes = reached(lambda: self.redis.eval(WRITE, 1, _key(id), attempt, *pairs))
         return method.decode()
 
     def sign_of_life(self, id: str, attempt: str) -> bool:
-        """Says that the run is alive. False once it was cancelled or asked for again."""
+        """Notes that the run is alive. False once it was cancelled or asked for again."""
         reached(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
         return bool(reached(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
 
     def worker_lives(self, methods: Sequence[str]) -> None:
-        """Says that a worker for these methods is alive."""
+        """Notes that a worker for these methods is alive."""
         with reaching():
             for method in methods:
                 self.redis.set(_worker(method), 1, ex=SIGN_OF_LIFE)
 
 
 def learns(method: str) -> bool:
-    """Whether making a policy may take hours: those methods that need modules of their own learn."""
+    """Whether the method learns, which may take hours: these are the methods that need additional modules."""
     return bool(METHODS.get(method).needs)
 
 
 def queue_of(method: str) -> str:
-    """The name of rq's queue for a method: each has its own, since not every worker can make them all."""
+    """The name of rq's queue for a method. Each has its own, since not every worker has all methods."""
     return f"specshield-{method}"
 
 

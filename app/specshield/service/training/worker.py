@@ -1,4 +1,4 @@
-"""The worker: `specshield worker`. One process takes jobs, a fork of it runs each."""
+"""The worker, `specshield worker`: one process takes jobs, and forks a process for each."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ from specshield.service.storage.marker import check_files
 from specshield.service.training.jobs import AGAIN, SIGN_OF_LIFE, Jobs, learns, queue_of
 from specshield.service.watch import logs
 
-CONNECT = 5.0  # [s] for a connection to the store; its answers may take as long as there is no work
-PATIENCE = 60  # tries, a second or more apart, to note how a run ended; chosen by hand
+CONNECT = 5.0  # [s] for a connection to the store; an answer may take until there is work
+PATIENCE = 60  # tries, a second or more apart, to note the end of a run; chosen by hand
 log = logging.getLogger("specshield")
 
 
 def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learner: bool = False) -> None:
-    """Work until told to stop, or until standard input ends: the server that started this one is gone.
+    """Works until it is told to stop. until_eof: also until standard input ends, as the server that started
+    this worker has ended.
 
-    Runs of methods that learn take hours, those of others seconds. So the former have a process of their own,
-    which this one starts. learner: whether this is that process. others: queues of jobs that are no training
-    runs and look after themselves; the second process has them too. Raises StoreError where the store has
-    failed the worker for good.
+    Runs of methods that learn take hours, other runs seconds. So the former have a second process, which this
+    one starts. learner: whether this is that process. others: queues with jobs of other packages, which the
+    second process takes too. Raises StoreError if the store is lost for good.
     """
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
-    held = tuple[int, ...]()  # keep the embedded store running: a run that is handed back needs it
+    held = tuple[int, ...]()  # descriptors that keep the embedded store running: handing a run back needs it
     if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
         held = embedded.held
     url = os.environ["REDIS_URL"] = settings.store_url  # for the runs, and for the second process
-    with suppress(StoreError):  # rq tells of a store that is away
+    with suppress(StoreError):  # rq logs that the store is away
         check_files(url, settings.files_at, settings.store_timeout)
     jobs = Jobs(settings)
     if until_eof:
         at_end_of_input(lambda: os.kill(os.getpid(), signal.SIGTERM))
-    methods = available()  # what is installed later is made by the next worker, whose queues include it
+    methods = available()  # methods that are installed later are those of the next worker
     learning = [name for name in methods if learns(name)]
     if not learner:
         _tell(methods)
@@ -66,7 +66,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
         nonlocal second
         jobs.worker_lives(methods)
         if (learning or others) and not learner and (second is None or second.poll() is not None):
-            # It ends when this process does: its standard input is a pipe.
+            # It ends with this process: its standard input is a pipe.
             command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
             second = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=held)
 
@@ -79,7 +79,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
 
 
 def _tell(methods: Sequence[str]) -> None:
-    """Says which policies this worker makes, and which it does not."""
+    """Logs the methods by which this worker makes policies, and those for which a module is missing."""
     log.info("this worker makes policies by %s", ", ".join(methods))
     for name, method in METHODS.usable():
         if name not in methods:
@@ -88,19 +88,19 @@ def _tell(methods: Sequence[str]) -> None:
 
 
 class _Worker(Worker):
-    """rq's worker, which on SIGTERM ends the run at once and hands it back: what it has learned is in its
-    checkpoint, with which the next worker goes on.
+    """rq's worker. On SIGTERM it ends the run at once and puts it back into the queue: the next worker goes
+    on from the run's checkpoint.
     """
 
-    max_connection_wait_time = 1.0  # [s] between looks for a store that is away; rq would wait up to 60 s
+    max_connection_wait_time = 1.0  # [s] between two tries to reach the store; rq would wait up to 60 s
 
     @reaching()
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]
-        # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
-        # time limit of these connections, before the first of them is made, to fit.
+        # A client of its own: rq waits for work longer than any answer of the store may take, and sets the
+        # time limit of these connections to fit before the first one is made.
         connection = connect_to_jobs(url, socket_timeout=None, socket_connect_timeout=CONNECT)
-        # rq asks for its own address; redis-py cannot read that of a unix socket whose path has " " or "=".
+        # rq asks for its own address, which redis-py cannot parse if a unix socket's path has " " or "=".
         connection.set_response_callback("CLIENT INFO", lambda answer, **_: {"addr": "unknown"})
         super().__init__(
             [*self._training, *others],
@@ -114,19 +114,19 @@ class _Worker(Worker):
 
     def execute_job(self, job: Job, queue: Any) -> None:
         def live() -> None:
-            if not self._jobs.sign_of_life(*job.args) and (run := self.horse_pid):  # 0: not begun, or ended
-                self._stopped_job_id = job.id  # rq then notes that it was meant to end
+            if not self._jobs.sign_of_life(*job.args) and (run := self.horse_pid):  # 0: it is not running
+                self._stopped_job_id = job.id  # so rq knows that it was ended on purpose
                 with suppress(ProcessLookupError):
                     os.killpg(run, signal.SIGKILL)
 
         self._running = job
-        # The worker gives signs of life too: on a busy machine the run itself may get no time for them.
+        # The worker too gives the run's signs of life: on a busy machine the run itself may be too slow.
         with _regularly(live) if job.origin in self._training else nullcontext():
             super().execute_job(job, queue)
         self._running = None
 
     def maintain_heartbeats(self, job: Job, execution: Any) -> None:
-        with suppress(*FAILURES):  # the next may find it again; rq would end the worker, and its run with it
+        with suppress(*FAILURES):  # the next one may succeed; rq would end the worker with its run
             super().maintain_heartbeats(job, execution)
 
     def request_stop(self, signum: int, frame: Any) -> None:
@@ -143,23 +143,23 @@ class _Worker(Worker):
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        late = (job.ended_at - job.started_at).total_seconds() > job.timeout  # then rq may have killed it
+        late = (job.ended_at - job.started_at).total_seconds() > job.timeout  # rq kills late runs
         reason = _too_long(job) if late else f"the process that made it ended {how}"
         self._jobs.end(job.args[0], job.id, f"{reason}; {AGAIN}")
 
 
 def train(id: str, attempt: str) -> None:
-    """One run, in a process of its own. The policy's `error` says why a run failed, whatever the reason."""
+    """Makes a policy, in a process for this run. If that fails, the policy's `error` says why."""
     follow_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
     jobs = Jobs(settings)
-    jobs.sign_of_life(id, attempt)  # first: a run that trains without one is taken for dead
+    jobs.sign_of_life(id, attempt)  # comes first: a run with the status `training` needs one
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
     logs.tell("making a policy", policy_id=id)
     with _regularly(lambda: jobs.sign_of_life(id, attempt)):
-        os.nice(10)  # this thread and those it starts: below servers and heavy/heavy.py; not signs of life
+        os.nice(10)  # of this thread and those that it starts, not of the signs of life: see heavy/heavy.py
         reason = None
         try:
             _train(settings, jobs, id, attempt)
@@ -168,9 +168,9 @@ def train(id: str, attempt: str) -> None:
         except JobTimeoutException:
             reason = f"{_too_long(get_current_job())}; {AGAIN}"
         except Exception as error:
-            log.exception("training of %s", id)  # its text may tell of the inside: paths, lines of code
+            log.exception("training of %s", id)  # callers do not get its text, which may have paths or code
             reason = f"an unexpected {type(error).__name__}; the worker's log says more"
-        for _ in range(PATIENCE):  # what it came to would be lost with a store that is away
+        for _ in range(PATIENCE):  # the store may be away for a while
             with suppress(StoreError):
                 jobs.end(id, attempt, reason)
                 break
@@ -179,11 +179,11 @@ def train(id: str, attempt: str) -> None:
 
 def _too_long(job: Any) -> str:
     setting = "TRAINING" if learns(job.origin.removeprefix(queue_of(""))) else "SYNTHESIS"
-    return f"it took more than the {job.timeout} s that it may, which SPECSHIELD_{setting}_TIMEOUT lengthens"
+    return f"it took more than the {job.timeout} s that SPECSHIELD_{setting}_TIMEOUT allows"
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> None:
-    # numba, torch and the rest are for the process of the run alone: the worker stays small.
+    # Imported here, in the process of the run, so that the worker itself stays small.
     from specshield.policy.notices import notices
     from specshield.service.library.claims import Claims
     from specshield.service.library.maps import Maps
@@ -193,7 +193,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> None:
     about = policies.record(id).about
 
     def on_progress(done: float, seconds_left: float, said: str) -> None:
-        with suppress(StoreError):  # it is told the next time; a run of hours does not end for it
+        with suppress(StoreError):  # the next report may succeed
             jobs.report(id, attempt, progress=round(done, 4), eta_s=round(seconds_left, 1))
 
     method = METHODS.get(about.method)
@@ -210,7 +210,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> None:
 
 @contextmanager
 def _regularly(action: Callable[[], object]) -> Iterator[None]:
-    """Repeats the action in a thread while the block lasts, several times within SIGN_OF_LIFE."""
+    """During the block, a thread repeats the action several times within SIGN_OF_LIFE."""
     over = threading.Event()
 
     def repeat() -> None:

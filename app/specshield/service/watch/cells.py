@@ -1,9 +1,8 @@
-"""Counts and histograms that cost a step little, and that a killed process leaves whole.
+"""Counts and histograms that take little time of a step, and that survive the kill of a process.
 
-Each process adds to float64 cells of a file of its own, mapped into memory; who is asked for metrics adds up
-the files of all. With prometheus_client, whose files hold names and times too, a count takes 1.4 us and an
-observation 2.9 us: 24 us a step. Here a step's take 3 us: `python -m benchmarks.watch`.
-Only the thread of the event loop adds.
+Each process has a file of float64 cells, mapped into memory, to which the thread of its event loop adds. The
+process that answers /metrics sums the files of all processes. The counts of a step take 3 us (`python -m
+benchmarks.watch`). With prometheus_client, whose files also hold names and times, they would take 24 us.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ SIZE = 512  # cells; a page of memory
 
 
 class Family(NamedTuple):
-    """A counter, or with `bounds` a histogram; with `label` one of each of its `values`.
+    """A counter, or with `bounds` a histogram; with `label` one for each of its `values`.
 
-    first: its first cell. A counter takes one; a histogram one a bucket, the last of them without a bound,
-    and one for its sum.
+    first: its first cell. A counter has one cell. A histogram has one for each bucket, of which the last has
+    no upper bound, and one for the sum.
     """
 
     name: str
@@ -92,7 +91,7 @@ class Cells:
         held[first + len(bounds) + 1] += value
 
     def collect(self) -> Iterator[Metric]:
-        """What all processes have counted."""
+        """The counts of all processes together."""
         held = [self.held.tobytes()]
         if self._folder is not None:
             held = [file.read_bytes() for file in self._folder.glob("*.cells")]
@@ -104,5 +103,5 @@ class Cells:
         if self._folder is None:
             return mmap.mmap(-1, SIZE * 8)
         with open(self._folder / f"{os.getpid()}.cells", "ab+", opener=private) as file:
-            file.truncate(SIZE * 8)  # what a process of the same number left goes on
+            file.truncate(SIZE * 8)  # keeps the counts of an earlier process with the same number
             return mmap.mmap(file.fileno(), SIZE * 8)

@@ -1,9 +1,9 @@
-"""Each decision of a session as it is made, for whoever watches: made here, or by any other server.
+"""Streams of decisions for watchers, whichever server makes the decisions.
 
-A step pays next to nothing for its watchers: what this process decides is noted, and written out once for
-all who watch, when their streams are told next. Each server process asks the store which of the other
-sessions watched here have gone on, ten times a second and a part of them at a time; those that are decided
-here it asks for seldom. A watcher who is behind reads the stored steps itself, a few at a time.
+Watchers cost a step next to nothing: a decision of this process is only noted, and written once for all
+watchers when their streams are served next. For sessions that other processes decide, each server process
+asks the store which of them have changed, ten times a second and a part of them at a time; for sessions that
+are decided here it seldom does. For a watcher that is behind, stored steps are read, a few at a time.
 """
 
 from __future__ import annotations
@@ -27,22 +27,23 @@ from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
 from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
-EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
-SELDOM = 10  # looks at the others to one at those that are decided here: whose end, or switch, shows so
-MOMENT, GIVE_WAY = 0.003, 30  # [s] about a decision, and how many such at most. By hand: nobody sees 0.1 s
-HERE = 3.0  # [s] since a session was decided here; by hand: a robot's next step is due in that time
-TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and more for each of
-# them: 0.5 s for 32. By hand: a message costs some 0.1 ms
-PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
-AWAY = 3.0  # [s] between two looks for a session in the archive, from where it may be erased. By hand
-HEARTBEAT = 15.0  # [s] without an event; chosen by hand, below what proxies wait
+# All chosen by hand.
+EVERY = 0.1  # [s] between two looks at a session: a page need not be quicker
+SELDOM = 10  # only each tenth look includes sessions that are decided here, to notice their ends and switches
+MOMENT, GIVE_WAY = 0.003, 30  # [s] about a decision, and the most of such waits: nobody sees 0.1 s
+HERE = 3.0  # [s] since the last decision here for which a session counts as decided here
+TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and in addition for
+# each session: 0.5 s for 32. A message takes some 0.1 ms.
+PARTS = 4  # in which the sessions are looked at, so that no look delays a decision for long
+AWAY = 3.0  # [s] between two looks whether an archived session still exists
+HEARTBEAT = 15.0  # [s] without an event after which a comment is sent: less than proxies wait
 FIRST = b"retry: 1000\n\n"
 log = logging.getLogger("specshield")
 
 
 class Watchers:
-    """limit: of streams at once in this process. stopping: whether the server is on its way out.
-    deciding: how many steps are being decided here.
+    """limit: the most open streams of this process. stopping: whether the server was told to stop. deciding:
+    the number of steps that are being decided here.
     """
 
     def __init__(
@@ -53,11 +54,11 @@ class Watchers:
         self._open = 0
 
     async def run(self) -> None:
-        """Looks at the sessions that are watched, until it is cancelled."""
+        """Looks for news of the watched sessions until it is cancelled."""
         for number in itertools.count():
             feeds = list(self._feeds.values())
             parts = min(PARTS, len(feeds))
-            if not parts:  # a process that wakes between steps makes them dearer
+            if not parts:  # sleeps longer, since waking up makes the steps of this process slower
                 await asyncio.sleep(EVERY)
             for part in range(parts):
                 await asyncio.sleep(EVERY / parts)
@@ -67,7 +68,7 @@ class Watchers:
                 try:
                     await self._look([feed for feed in feeds[part::parts] if all or feed.here < elsewhere])
                 except SpecshieldError:
-                    pass  # the store is away: what is missed is read when it is back
+                    pass  # the store is away: the news are read when it is back
                 except Exception:
                     log.exception("what is new in a session cannot be read")
             if self._stopping():
@@ -84,8 +85,8 @@ class Watchers:
         made: StepRecord,
         answered: StepAnswer,
     ) -> None:
-        """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
-        to the watchers, they read it from the store; so they do of a rule's first step, with its switch.
+        """Notes a step that this process has decided and stored (`steps.Tell`). If the watchers lack more
+        than this step, or it follows a switch, it is read from the store later, with all that they lack.
         """
         feed = self._feeds.get(id)
         if feed is not None and feed.version == before and made.t >= feed.end > rules.begins(feed.rules[-1]):
@@ -95,9 +96,8 @@ class Watchers:
             feed.add(state, [each], made.t + 1, made.t + 1)
 
     async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
-        """The stream of what follows step `after`, by default the last one decided; None where nothing will.
-
-        Raises NotFound, LimitReached.
+        """The stream of the decisions after step `after`, by default after the last decided one. None if
+        there will be none. Raises NotFound, LimitReached.
         """
         self._check_room()
         feed = self._feeds.get(id) or await self._begin(id)
@@ -105,8 +105,8 @@ class Watchers:
         return None if feed.over and t >= feed.end else self._stream({feed: t}, several=False)
 
     async def open_all(self, after: Mapping[str, int | None]) -> AsyncIterator[bytes]:
-        """One stream of what follows in several sessions, each after its own step; those that are not there
-        are left out. Raises LimitReached.
+        """One stream of the decisions of several sessions, each after its own step. Sessions that do not
+        exist are left out. Raises LimitReached.
         """
         self._check_room()
         places = {}
@@ -117,7 +117,7 @@ class Watchers:
         return self._stream(places, several=True)
 
     async def _idle(self) -> None:
-        """Lets the steps go first that are being decided here."""
+        """Waits a little while steps are being decided here."""
         for _ in range(GIVE_WAY):
             if not self._deciding():
                 return
@@ -131,7 +131,7 @@ class Watchers:
             )
 
     async def _stream(self, after: Mapping[Feed, int], several: bool) -> AsyncIterator[bytes]:
-        """Of `several` sessions the events are gathered; that of one tells each at once."""
+        """Serves one session at once, and `several` sessions from time to time with all their events."""
         places = {self._feeds.setdefault(feed.id, feed): t for feed, t in after.items()}
         feeds, told_at = list(places), time.monotonic()
         with self._watching(feeds):
@@ -188,14 +188,14 @@ class Watchers:
         seen = list(zip(feeds, before, versions, strict=True))
         gone_on = [
             (feed, version) for feed, known, version in seen if version != known and feed.version == known
-        ]  # one that was decided here meanwhile is looked at next time
+        ]  # sessions that were decided here meanwhile are looked at next time
         if here := [(feed, version) for feed, version in gone_on if version is not None]:
             ends = [feed.end for feed, _ in here]
             news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
             for (feed, version), end, new in zip(here, ends, news, strict=True):
-                if feed.end != end or new is None:  # one that has left the store meanwhile is read next time
+                if feed.end != end or new is None:  # it has changed or left the store meanwhile: next time
                     continue
-                if feed.version is None:  # it is back from the archive, or another one has its id
+                if feed.version is None:  # it is back from the archive, or another session has its id
                     if await self._switched(feed):
                         feed.version = b""
                     else:
@@ -209,23 +209,23 @@ class Watchers:
 
     def _gone_on(self, feed: Feed, version: bytes, new: News) -> None:
         if begun(version) != begun(feed.version or version):
-            feed.close()  # it was erased, and another session of this id was begun
+            feed.close()  # it was erased, and another session was begun with its id
             return
         state, (found, end) = State.of(new.state), feed.events(feed.end, new)
         upto = feed.reached(end, new)
         feed.add(state, found, end, upto)
-        if upto >= state.next_t:  # else there is more, for the next look
+        if upto >= state.next_t:  # else the next look reads the rest
             feed.version = version
 
     async def _switched(self, feed: Feed) -> bool:
-        """Reads the rules anew; what else is new is for the next look. False where the session is gone."""
+        """Reads the rules again; other news are for the next look. False if the session is gone."""
         found = await self._store.load(feed.id)
         return found is not None and feed.rule(Session.of(found))
 
     async def _left(self, feed: Feed) -> None:
         """The session is no longer in the store: it was erased, or lies in the archive."""
         known, dump, feed.looked = feed.version, await self._store.dump(feed.id), time.monotonic()
-        if feed.version != known:  # a step that was decided here meanwhile has brought it back
+        if feed.version != known:  # a step of this process has brought it back meanwhile
             return
         if dump is None or not feed.rule(Session.of(dump)):
             feed.close()
@@ -236,7 +236,7 @@ class Watchers:
         feed.version = None
 
     async def _since(self, feed: Feed, t: int) -> tuple[list[Told], int]:
-        """Decisions from step t on, and the step that follows them; what is not kept is read."""
+        """Decisions from step t on, and the step that follows them. Older ones are read from the store."""
         if t >= feed.start:
             return feed.since(t), max(t, feed.end)
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])

@@ -1,4 +1,4 @@
-"""What is told of one session that is watched: its latest decisions, and how they are written as events."""
+"""The latest decisions of one watched session, and how they are written as events."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from specshield.service.sessions.session import Session, describe
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News
 
-KEPT = 64  # events kept for the watchers of a session, and read at once
+KEPT = 64  # events that are kept for the watchers of a session, and the most that are read at once
 
 
 @dataclass(frozen=True)
 class Told:
-    """A decision as it is told. session: its id. switch: events that come before it. rule: which of the
-    session's rules held. pose: x_t. made: the record of the step. answered: what was answered.
+    """A decision for watchers. session: its id. switch: events that come before it. rule: the index of the
+    session's rule. pose: x_t. made: the record of the step. answered: its answer.
 
-    It is written when somebody reads it, and once for all who do.
+    The events are written when they are needed, once for all watchers.
     """
 
     session: str
@@ -59,13 +59,12 @@ class Told:
 
 @dataclass(eq=False)
 class Feed:
-    """A session that is watched here. rules: those that it has had, `told` as the contract shows them. width:
-    bytes of a row.
+    """A watched session. rules: all rules so far; told: the same as the contract shows them. width: bytes of
+    a row.
 
-    recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
-    a session that is not in the store, and b"" for one that has come back there and was not read yet. looked:
-    when it was last looked for in the archive; here: when it was last decided in this process. Both in
-    seconds of time.monotonic.
+    recent: the decisions of the steps from `start` to before `end`. version: the last one that was read; None
+    if the session is not in the store, b"" if it has come back and was not read yet. looked: when it was last
+    looked for in the archive; here: when this process last decided a step of it [s of time.monotonic].
     """
 
     id: str
@@ -84,17 +83,19 @@ class Feed:
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
     def add(self, state: State, found: Sequence[Told], end: int, reached: int) -> None:
-        """end: the step that follows those read; reached: the same, past those that a switch passed over."""
+        """Adds decisions. end: the step after those that were read. reached: the same, but after steps that a
+        switch has passed over.
+        """
         for each in found:
             if len(self.recent) == KEPT:
                 self.start = self.recent[0].t + 1
             self.recent.append(each)
         self.over, self.status = state.finished and reached >= state.next_t, state.spec_status
-        self.end = reached if self.over else end  # a switch that is not told yet lies from `end` on
+        self.end = reached if self.over else end  # a switch of which no event has told is at `end` or later
         self.wake()
 
     def since(self, t: int) -> list[Told]:
-        """The decisions from step t on, of those that are kept."""
+        """The kept decisions from step t on."""
         found = []
         for each in reversed(self.recent):
             if each.t < t:
@@ -103,7 +104,7 @@ class Feed:
         return found[::-1]
 
     def rule(self, session: Session) -> bool:
-        """Takes over the rules that the session has had by now; False where this is another one of its id."""
+        """Takes over the session's rules. False if this is another session with the same id."""
         rules, told, width = ruled(session)
         if rules[0].get("nonce") != self.rules[0].get("nonce"):
             return False
@@ -120,8 +121,8 @@ class Feed:
         self.changed = asyncio.Event()
 
     def events(self, t: int, new: News) -> tuple[list[Told], int]:
-        """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
-        after a switch brings the switch.
+        """The decisions in `new`, whose steps begin with t, and the step that follows them. The first
+        decision after a switch has the event of the switch.
         """
         found = []
         switched = [rule for rule in self.told[1:] if rule["from"] >= t]
@@ -138,18 +139,18 @@ class Feed:
         return found, t + len(new.steps)
 
     def reached(self, end: int, new: News) -> int:
-        """The step that follows those that `new` has, which end before `end`, and those that the last switch
-        passed over: these are not in the list until one is decided after them. The state does not tell of
-        them: it may be newer than the steps.
+        """The step that follows those in `new`, which end before `end`, and those that the last switch passed
+        over: the list has these only once a later step is decided. The state cannot show that, since it may
+        be newer than the steps.
         """
         return end if len(new.steps) == KEPT else max(end, rules.begins(self.rules[-1]))
 
     def outdated(self, new: News) -> bool:
-        """Whether the session has had a switch that this does not know of; its rows may be wider since."""
+        """Whether the session has had a switch that this feed does not know; its rows may be wider now."""
         return len(State.of(new.state).verdicts) >= len(self.rules)
 
     def last(self, several: bool) -> bytes:
-        """The last event; in a stream of several sessions it says which one has ended."""
+        """The last event. In a stream of several sessions it names the session that has ended."""
         told = {"next_t": self.end, "spec_status": self.status, "finished": True}
         if several:
             return b"data: %s\n\n" % json.dumps({"session": shown(self.id), **told}).encode()
@@ -157,11 +158,11 @@ class Feed:
 
 
 def ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
-    """`Feed.rules`, `told` and `width`."""
+    """The members `rules`, `told` and `width` of a `Feed`."""
     told = describe(session.rules, session.state)["rules"]
     return session.rules, told, 8 * session.rows.shape[1]
 
 
 def begun(version: bytes) -> bytes:
-    """What tells one session of an id from another."""
+    """The part of a version that differs between two sessions with the same id."""
     return version.partition(b":")[0]

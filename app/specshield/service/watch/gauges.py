@@ -12,11 +12,11 @@ from specshield.service.storage.store import Store
 from specshield.service.training.jobs import Jobs
 
 Kind = type[GaugeMetricFamily] | type[CounterMetricFamily]
-KEPT_FOR = 2.0  # [s] a scrape is answered from the one before; chosen by hand
+KEPT_FOR = 2.0  # [s] for which the values of a scrape answer further ones; chosen by hand
 
 
 class Gauges:
-    """Sessions, jobs and memory. While the store is away there is `specshield_store_up 0` alone."""
+    """Numbers of sessions and jobs, and the store's memory; only `specshield_store_up 0` while it is away."""
 
     def __init__(self, store: Store, jobs: Jobs) -> None:
         self._store, self._jobs = store, jobs
@@ -25,7 +25,7 @@ class Gauges:
 
     async def read(self) -> list[Metric]:
         """The families, at most KEPT_FOR old."""
-        async with self._asking:  # of many scrapes at once one asks
+        async with self._asking:  # of several scrapes at once, only one asks the store
             if time.monotonic() - self._asked > KEPT_FOR:
                 try:
                     self._found = await self._families()

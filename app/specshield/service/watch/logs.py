@@ -1,10 +1,10 @@
-"""Lines of the log, as text or as JSON (one object a line). They hold neither keys nor bodies.
+"""Lines of the log, as text or as JSON (one object in each line). They hold no keys and no bodies.
 
     logs.tell("session begun", session_id=id)               # at info
     logs.tell("decided", logging.DEBUG, t=3, mode="shaped")
 
-Inside a request its id, its session and its trace (of the header `traceparent`) are added where the line is
-written, so a request that logs nothing pays for none of it.
+Within a request, its id, its session and its trace (from the header `traceparent`) are added when the line is
+written, so they take no time of a request that logs nothing.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from uvicorn.config import LOGGING_CONFIG
 from uvicorn.logging import DefaultFormatter
 
 log = logging.getLogger("specshield")
-request: ContextVar[Scope | None] = ContextVar("request", default=None)  # the one that is being answered
+request: ContextVar[Scope | None] = ContextVar("request", default=None)  # the request that is being answered
 TRACEPARENT = re.compile(rb"[0-9a-f]{2}-([0-9a-f]{32})-([0-9a-f]{16})-[0-9a-f]{2}")  # W3C Trace Context
-# What uvicorn 0.54 writes of a WebSocket that was refused, as it should be; of one that sent what is not
-# UTF-8; and of one that was opened, of whose end it writes nothing.
+# Lines of uvicorn 0.54 that are left out: for a WebSocket that was refused on purpose, for one that sent
+# bytes that are not UTF-8, and for one that was opened (there is no line for its end).
 NO_NEWS = {
     "ASGI callable returned without completing handshake.",
     "Invalid UTF-8 sequence received from client.",
     "connection open",
 }
-PLAIN = re.compile(r"[\w.:/{}@+-]+")  # what a text line shows without quotes
+PLAIN = re.compile(r"[\w.:/{}@+-]+")  # texts that a line shows without quotes
 
 
 def tell(message: str, level: int = logging.INFO, /, **about: Any) -> None:
-    """One line: what happened, and what it was about."""
+    """Logs one line: what happened, and the values that belong to it."""
     if log.isEnabledFor(level):
         log.log(level, message, extra={"about": about})
 
 
 def config(form: str, level: str) -> dict[str, Any]:
-    """For uvicorn and for logging.config.dictConfig: all lines go to standard error in one form."""
+    """The configuration for uvicorn and logging.config.dictConfig: all lines go to standard error."""
     kind = "specshield.service.watch.logs." + ("Json" if form == "json" else "Text")
     own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
     loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
     formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
     handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_news]}}
-    # Access lines are the metrics' and the refusals' part: uvicorn's own cost a request some 60 us.
+    # Metrics and the lines for refused requests take the place of uvicorn's access log, which takes some 60
+    # us.
     del loggers["uvicorn.access"]
     return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
 
@@ -56,17 +57,17 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 
 class Text(DefaultFormatter):
-    """uvicorn's form, with what a line is about after it: `INFO:     session begun  session_id=a`."""
+    """uvicorn's form, followed by the values: `INFO:     session begun  session_id=a`."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
-        if record.name == log.name:  # a path that a caller made up must not begin a line of its own
+        if record.name == log.name:  # a newline in a caller's path must not begin another line
             record.message = record.message.replace("\r", "\\r").replace("\n", "\\n")
         shown = " ".join(f"{name}={_plain(value)}" for name, value in _about(record).items())
         return super().formatMessage(record) + (f"  {shown}" if shown else "")
 
 
 class Json(logging.Formatter):
-    """time, level, logger, message, what the line is about, and the traceback where there is one."""
+    """An object with time, level, logger, message, the values, and the traceback if there is one."""
 
     def __init__(self, **_: Any) -> None:
         super().__init__()

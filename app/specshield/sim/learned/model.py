@@ -1,9 +1,9 @@
 """The learned foundation model: it imitates shortest paths, as SPOC does, and knows no rule and no region.
 
-It is given egocentric senses only: a range scan, whether and where its target is seen, what it is told to
-find, and the action that was executed last, which the shield may have chosen. Its memory is its own, and so
-is its count of where it has come since it began (reckoning.py). The shipped weights were trained in generated
-apartments alone, with interference as a shield's (evaluation/model/practice.py); the card has the figures.
+Its input is a range scan, whether and where its target is seen, what it has to find, and the last executed
+action, which the shield may have chosen. It has its own memory, and its own count of where it is since it
+began (reckoning.py). The shipped weights were trained only in generated apartments, with interference like a
+shield's (evaluation/model/practice.py); the card has the figures.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
 
 
 class LearnedModel:
-    """weights: as `check` returns them. target: one of KINDS. temperature: what the logits are divided by."""
+    """weights: as `check` returns them. target: one of KINDS. temperature: by which logits are divided."""
 
     def __init__(self, weights: Mapping[str, Singles], target: str, temperature: float) -> None:
         self._network, self._kind, self._temperature = Network(weights), KINDS.index(target), temperature
         self._reckoning = Reckoning(1)
 
     def reset(self, random: np.random.Generator) -> None:
-        """Forgets the last episode. The model itself draws nothing."""
+        """Forgets the last episode. The model does not use `random`."""
         self._network.reset()
         self._reckoning = Reckoning(1)
 
     def logits(self, robot: SimulatedRobot) -> Floats:
-        """Finite logits (A,) of what to do next."""
+        """Finite logits (A,) for the next action."""
         senses = robot.sense()
         seen = (float(senses.seen), senses.distance, senses.bearing)
         last = NOTHING if senses.last_action is None else senses.last_action
@@ -55,7 +55,7 @@ class LearnedModel:
 
 
 def load_learned(instruction: str, folder: Path = MODELS / FOLDER) -> LearnedModel:
-    """The model in `folder`, told an instruction. Raises NotFound, PolicyError."""
+    """The model in `folder`, with an instruction. Raises NotFound, PolicyError."""
     shipped = read(folder)
     return LearnedModel(shipped.weights, target_of(instruction), shipped.temperature)
 
@@ -71,7 +71,7 @@ def target_of(instruction: str) -> str:
 
 
 class Shipped(NamedTuple):
-    """A model as it is in a folder: checked weights, temperature, and the card."""
+    """The content of a model's folder: checked weights, temperature, and the card."""
 
     weights: dict[str, Singles]
     temperature: float
@@ -80,7 +80,7 @@ class Shipped(NamedTuple):
 
 @lru_cache(maxsize=4)
 def read(folder: Path) -> Shipped:
-    """Raises NotFound, PolicyError."""
+    """Reads a model from its folder. Raises NotFound, PolicyError."""
     path = folder / WEIGHTS
     if not path.is_file():
         raise NotFound(

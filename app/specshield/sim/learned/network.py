@@ -1,10 +1,10 @@
 """The learned model's network without torch: a causal transformer, one step at a time, in NumPy.
 
-A step's input is what the robot senses, what it looks for, the action that was executed last, and where it
-is by its own count of its actions (reckoning.py). The blocks are pre-norm. Attention covers the last WINDOW
-steps, with less weight on steps longer ago (ALiBi: Press et al., 2022) and, for some heads, on steps made
-farther away; its result holds the way to where those steps were made, beside their values. The absolute time
-and place have no influence. Keys and values are kept from step to step.
+The input of a step is what the robot senses, what it looks for, the last executed action, and where it is by
+its own count of its actions (reckoning.py). The blocks are pre-norm. Attention covers the last WINDOW steps,
+with less weight on older steps (ALiBi: Press et al., 2022) and, for some heads, on steps farther away. Its
+result has the way to the places of those steps, beside their values. The absolute time and place have no
+influence. Keys and values are kept from step to step.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ KINDS = ("bowl", "pan", "laptop", "pillow", "remote", "soap")
 """What the model can be told to find."""
 
 ACTIONS = len(STRETCH.actions)
-NOTHING = ACTIONS  # the last action of a robot that has done nothing yet
+NOTHING = ACTIONS  # the token for the last action of a robot that has not acted yet
 INPUTS = RAYS + 3  # ranges, seen, distance, bearing
 FEATURES = 2 * RAYS + 7
 UNITS, LAYERS, WINDOW = 128, 3, 256
-SLOPES = (2.0**-2, 2.0**-4, 2.0**-7, 2.0**-9)  # of each head: taken off a score for each step ago
-FAR = (0.0, 0.0, 0.25, 2.0)  # of each head: taken off a score for each metre away
-SPAN = 5.0  # [m] a way to what is remembered is given as a share of this
+SLOPES = (2.0**-2, 2.0**-4, 2.0**-7, 2.0**-9)  # for each head, subtracted from a score for each step ago
+FAR = (0.0, 0.0, 0.25, 2.0)  # for each head, subtracted from a score for each metre away
+SPAN = 5.0  # [m] by which ways to remembered places are divided
 
-TEMPERATURE = 0.7  # as it is trained to drive, and shipped
-FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
-RELUCTANCE = 2.0  # [nats] off an action that undoes the last one; otherwise it turns to and fro when unsure
-PATIENCE = 2.0  # [nats] off an action for each time, TIRED at most, that it has changed nothing
+TEMPERATURE = 0.7  # of training, and of the shipped model
+FLOOR = 16.0  # [nats] no logit is further below the best one
+RELUCTANCE = 2.0  # [nats] off an action that undoes the last one: an unsure model would turn to and fro
+PATIENCE = 2.0  # [nats] off an action for each of the last times, TIRED at most, that it changed nothing
 TIRED = 4
 OPPOSITE = np.array([3, 2, 1, 0, -1, -1, 7, 6, *[-1] * (ACTIONS - 7)])  # of each last action, -1 for none
 
 
 def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Singles:
-    """What the network is given: ranges on a scale from 0 to 1, finest nearby, and where the target is seen.
+    """The network's input: ranges on a scale from 0 to 1, finest nearby, and where the target is seen.
 
-    The ranges are given once more as from the heading it began with, and its heading beside them: what it
-    sees of a place is then like what it saw there before. senses [..., INPUTS]: ranges [m], seen (0 or 1),
-    distance [m], bearing [rad]. heading [...]: as it counts it [rad]. Result [..., FEATURES].
+    The ranges are repeated as seen from the initial heading, with the heading beside them, so that the robot
+    sees a place as it saw it before. senses [..., INPUTS]: ranges [m], seen (0 or 1), distance [m], bearing
+    [rad]. heading [...]: by its own count [rad]. Result [..., FEATURES].
     """
     seen, distance, bearing = senses[..., RAYS], senses[..., RAYS + 1], senses[..., RAYS + 2]
     ranges = np.log1p(senses[..., :RAYS] / 0.25) / np.log1p(REACH / 0.25)
@@ -64,7 +64,7 @@ def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Sin
 
 
 def decoded(raw: Singles, last: Ints, futile: Ints, temperature: float) -> Floats:
-    """The logits that are drawn from, [N, A]. raw [N, A]; last [N]; futile [N, A + 1]: as reckoned."""
+    """The model's logits [N, A]. raw [N, A]: of the network. last [N]. futile [N, A + 1]: of `Reckoning`."""
     logits = raw - PATIENCE * np.minimum(futile[:, :ACTIONS], TIRED)
     undo = OPPOSITE[last]
     some = np.nonzero(undo >= 0)[0]
@@ -92,7 +92,7 @@ SHAPES = _shapes()
 
 
 def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
-    """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
+    """Checks weights that come from outside. Raises PolicyError, which names the wrong tensor."""
     got, expected = sorted(weights), sorted(SHAPES)
     if got != expected:
         told = "not the tensors of a foundation model"
@@ -110,7 +110,7 @@ def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
 
 
 class Network:
-    """An episode step by step, with a memory of WINDOW steps; `reset` empties it. weights: checked."""
+    """The network in an episode, with a memory of WINDOW steps; `reset` empties it. weights: checked."""
 
     def __init__(self, weights: Mapping[str, Singles]) -> None:
         self._w = weights
@@ -129,7 +129,7 @@ class Network:
         self._t = 0
 
     def step(self, x: Singles, place: NDArray[np.floating], last: int, kind: int) -> Singles:
-        """Logits (ACTIONS,) of the next step. x (FEATURES,); place (3,), as counted; last, kind: tokens."""
+        """Logits (ACTIONS,) for the next step. x (FEATURES,). place (3,), as counted. last, kind: tokens."""
         w, heads = self._w, len(SLOPES)
         slot, held = self._t % WINDOW, min(self._t + 1, WINDOW)
         bias = self._bias[:, WINDOW - 1 - slot : WINDOW - 1 - slot + held]

@@ -1,7 +1,7 @@
-"""How the model keeps count of where it has come since it began, from the actions that were executed.
+"""The model's own count of where it is since it began, from the executed actions.
 
-It is given no pose and no map. A move counts as a whole one if the range scan changed at all, and as none if
-it did not. Slips, walls that stop a move short and noise make the count wrong, and nothing corrects it.
+It has no pose and no map. A move counts in full if the range scan changed at all, else not. Slips, walls that
+stop a move and noise make the count wrong, and nothing corrects it.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from specshield.arrays import Ints
 from specshield.robot import STRETCH
 from specshield.sim.senses import RAYS
 
-MOVES = np.array([*((a.translate, a.rotate) for a in STRETCH.actions), (0.0, 0.0)])  # at last: nothing yet
-CHANGED = 0.005  # [m] that some range has to change by
+MOVES = np.array([*((a.translate, a.rotate) for a in STRETCH.actions), (0.0, 0.0)])  # the last: no action yet
+CHANGED = 0.005  # [m] by which some range has to change
 
 
 class Reckoning:
-    """Of n robots.
+    """The counts of n robots.
 
-    place [n, 3]: x, y [m] and heading [rad] from where, and how, each one began. futile [n, A + 1]: how often
-    an action was executed since the scan changed last.
+    place [n, 3]: x, y [m] and heading [rad], relative to where each robot began. futile [n, A + 1]: how often
+    each action was executed since the scan changed last.
     """
 
     def __init__(self, n: int) -> None:
@@ -30,7 +30,7 @@ class Reckoning:
         self._ranges = np.full((n, RAYS), np.inf)
 
     def count(self, ranges: NDArray[np.floating], last: Ints) -> None:
-        """Goes on after `last` [n] was executed, and `ranges` [n, RAYS] [m] scanned."""
+        """Counts the executed actions `last` [n], with the scans `ranges` [n, RAYS] [m] after them."""
         moved = (np.abs(ranges - self._ranges) > CHANGED).any(axis=1)
         translate, rotate = (MOVES[last] * moved[:, None]).T
         heading = self.place[:, 2]
