@@ -1,4 +1,4 @@
-// Which view is shown: the part of the address after '#', such as #/sessions/robot-1.
+// Shows the view that the address names after '#', such as #/sessions/robot-1.
 
 import { fetched, Problem } from "./lib/api.js";
 import { el, problem } from "./lib/dom.js";
@@ -16,12 +16,12 @@ const VIEWS = [
   [/^\/try\/([^/]+)$/, () => import("./views/trial.js")],
 ];
 
-const ANEW = "specshield.anew"; // in the tab: for which view the page began anew, to read its module
+const ANEW = "specshield.anew"; // key of the tab's storage: the view for whose module the page was loaded again
 const main = document.querySelector("main");
 let leaving = new AbortController();
 
 async function show() {
-  leaving.abort(); // what the view before still does
+  leaving.abort(); // ends what the view before still does
   leaving = new AbortController();
   const { signal } = leaving;
   const [path, query] = (location.hash.slice(1) || "/").split("?");
@@ -39,7 +39,7 @@ async function show() {
   const shown = { id, query: new URLSearchParams(query), signal };
   try {
     await patiently(async () => {
-      place.replaceChildren(); // what an attempt before has left
+      place.replaceChildren(); // removes what an earlier attempt has left
       await (await module(load, signal)).show(place, shown);
     }, signal);
   } catch (error) {
@@ -47,19 +47,19 @@ async function show() {
   }
 }
 
-/** The view of a path, and what it is a view of. Nothing where there is none. */
+/** The view of a path, and the id in it; [] if there is no such view. */
 function found(path) {
   const [match, load] = VIEWS.map(([form, load]) => [form.exec(path), load]).find(([match]) => match) ?? [];
   try {
     return match ? [load, decodeURIComponent(match[1] ?? "")] : [];
   } catch {
-    return []; // an id that is written as none can be
+    return []; // the id is not encoded correctly
   }
 }
 
 /**
- * A view's module. That it cannot be read tells nothing of the server, so that the server is asked. A browser
- * does not read a module again that it could not read once, unless the page begins anew.
+ * A view's module. If it cannot be loaded, the error does not say why, so the server is asked for a file. A browser
+ * tries to load a module only once, until the page is loaded again.
  */
 async function module(load, signal) {
   let loaded;
@@ -68,7 +68,7 @@ async function module(load, signal) {
   } catch (error) {
     await fetched("page/main.js", { cache: "no-store" });
     signal.throwIfAborted();
-    if (sessionStorage.getItem(ANEW) === location.hash) throw error; // it did for this view, and still cannot
+    if (sessionStorage.getItem(ANEW) === location.hash) throw error; // the page was loaded again in vain
     sessionStorage.setItem(ANEW, location.hash);
     location.reload();
     return new Promise(() => {}); // this page is about to go
@@ -77,7 +77,7 @@ async function module(load, signal) {
   return loaded;
 }
 
-/** As soon as the view has its heading, the window is called after it, and the keyboard is in the view. */
+/** Once the view has its heading, gives it to the window as the title, and moves the focus into the view. */
 function headed(place, signal) {
   const changed = new MutationObserver(() => {
     const heading = place.querySelector("h1");

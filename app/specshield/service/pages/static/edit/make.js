@@ -1,4 +1,4 @@
-// What the policy is made for, and by which method.
+// The form that asks for a policy: its robot, method and name.
 
 import { ask } from "../lib/api.js";
 import { el } from "../lib/dom.js";

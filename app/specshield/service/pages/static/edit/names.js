@@ -1,4 +1,4 @@
-// Names of regions: what can be one, and how one is changed in the text of a rule.
+// Names of regions: checks them, and changes them in the text of a rule.
 
 const LONGEST = 64; // characters
 const OPERATORS = ["F", "G", "U", "not", "always", "eventually", "until", "and", "or", "implies", "abs"];
@@ -6,8 +6,8 @@ const BODY = ["touches", "inside"]; // operators where a parenthesis follows; el
 const POSE = ["x", "y", "theta"];
 const WORDS = /(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[A-Za-z_]\w*/g; // the numbers and words of a rule
 
-/** Why this cannot be the name of a region, or of a signal, as the end of a sentence; empty where it can.
- *  taken: by others, which are `what`.
+/** Why a region or signal cannot have this name, as the end of a sentence; "" if it can.
+ *  taken: the names of others. what: what these are.
  */
 export function unfit(name, taken, what) {
   if (name === "") return "is empty: write at least one letter";
@@ -21,7 +21,7 @@ export function unfit(name, taken, what) {
 
 /** The text of a rule in which a region has another name. Operators and numbers stay as they are. */
 export function renamed(text, from, to) {
-  if (OPERATORS.includes(from)) return text; // as an operator it stands there, and never as a name
+  if (OPERATORS.includes(from)) return text; // in the text it is an operator, never a name
   return text.replace(WORDS, (word, at) => {
     const operator = BODY.includes(word) && /^\s*\(/.test(text.slice(at + word.length));
     return word === from && !operator ? to : word;

@@ -1,8 +1,8 @@
-// The numbers of a region, to be typed.
+// Fields in which the numbers of a region can be typed.
 
 import { el } from "../lib/dom.js";
 
-/** Inputs for the numbers of a region. changed: called when one is another; tell: with what is wrong, or nothing. */
+/** Fields for the numbers of a region. changed: called after a change. tell: called with what is wrong, or "". */
 export function numbers(region, changed, tell) {
   const input = (label, holder, key) => number(label, holder, key, changed, tell);
   if (region.type === "circle") return [input("x", region.center, 0), input("y", region.center, 1), input("r", region, "radius")];

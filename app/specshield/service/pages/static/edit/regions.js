@@ -6,7 +6,7 @@ import { unfit } from "./names.js";
 import { numbers } from "./numbers.js";
 
 export class Regions {
-  /** regions, signals: by name; changed: called when the regions are others. rooms: the names of the map's rooms. */
+  /** regions, signals: by name. changed: called when the regions have changed. rooms: names of the map's rooms. */
   constructor(floor, regions, signals, rooms, changed) {
     Object.assign(this, { floor, regions, signals, rooms, changed });
     this.drawing = new Drawing(floor, (region) => this.add(region));
@@ -29,7 +29,7 @@ export class Regions {
     row.querySelector("input").select();
   }
 
-  /** The names that no further region can have. It can have that of a room, which it then stands for. */
+  /** The names that no further region can have. It may have the name of a room, which it then replaces. */
   taken() {
     return [...Object.keys(this.regions), ...Object.keys(this.signals)];
   }

@@ -1,4 +1,4 @@
-// The rule as text: checked while it is written, the error underlined where it is, its windows on a time line.
+// The rule as text. It is checked while it is written: errors are underlined, and its windows are drawn on a time line.
 
 import { ask } from "../lib/api.js";
 import { button, el, later } from "../lib/dom.js";
@@ -13,8 +13,8 @@ const PATTERNS = [
 ];
 
 export class Rule {
-  /** edited: called with the text at each change. told: called with the server's answer for a rule that is right,
-   *  with null for one that is not.
+  /** edited: called with the text at each change. told: called with the server's answer for a valid rule, with null
+   *  for an invalid one.
    */
   constructor(text, map, regions, signals, edited, told) {
     Object.assign(this, { map, regions, signals, edited, told });
@@ -49,19 +49,19 @@ export class Rule {
     return this.input.value.trim();
   }
 
-  /** The text is another, or what it is about. */
+  /** To be called when the text or the names in it have changed. */
   changed() {
     this.edited(this.input.value);
     this.mark(null);
     this.check();
   }
 
-  /** A region has another name. */
+  /** To be called when a region has got another name. */
   renamed(from, to) {
     this.input.value = renamed(this.input.value, from, to);
   }
 
-  /** name: of the region that the patterns are about at first; a room may be chosen as well. */
+  /** Shows the patterns. name: of the region that is chosen at first; a room may be chosen too. */
   show(name) {
     const names = [...new Set([...Object.keys(this.regions), ...Object.keys(this.map.rooms)])];
     if (!names.length) return this.patterns.replaceChildren();

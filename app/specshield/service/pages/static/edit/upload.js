@@ -1,4 +1,4 @@
-// What was dropped, as the request that sends it.
+// Makes the request that sends a map of the files that were dropped.
 
 const ends = (file, ...kinds) => kinds.some((kind) => file.name.toLowerCase().endsWith(kind));
 

@@ -1,4 +1,4 @@
-// The server's API, with the key that this tab was given.
+// Calls the server's API with the key that was entered in this tab.
 
 import { askForKey, key } from "./key.js";
 import { notice } from "./notice.js";
@@ -23,7 +23,7 @@ export class Problem extends Error {
 
 const wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
 
-/** What comes from the network. Where nothing comes, or not all of it, that is a Problem as any other. */
+/** Waits for something from the network. If it does not come, or not all of it, throws a Problem. */
 async function arrived(coming) {
   try {
     return await coming;
@@ -33,7 +33,7 @@ async function arrived(coming) {
   }
 }
 
-/** Asks until the server is ready and has its key; gives the response of a request that succeeded. */
+/** Sends a request until the server is ready and has its key. Returns a successful response. */
 export async function fetched(path, options = {}) {
   for (let wrong = false; ; ) {
     const shown = key();
@@ -55,7 +55,7 @@ export async function fetched(path, options = {}) {
   }
 }
 
-/** JSON of an answer. json: a body to send; form: files to send. */
+/** Sends a request and returns the answer's JSON. json: a body to send. form: files to send. */
 export async function ask(path, { json, form, ...options } = {}) {
   const sent =
     json !== undefined
@@ -81,8 +81,8 @@ export async function all(path, options) {
 export const picture = async (path, options) => arrived((await fetched(path, options)).blob());
 
 /**
- * The data of server-sent events, as they come: by fetch, since an EventSource shows no key.
- * alive: called whenever the server has sent something, be it only that it is there.
+ * The data of server-sent events as they come, by fetch, since an EventSource cannot send a key.
+ * alive: called whenever the server has sent something, even a comment.
  */
 export async function* events(path, signal, alive) {
   const response = await fetched(path, { signal, headers: { Accept: "text/event-stream" } });

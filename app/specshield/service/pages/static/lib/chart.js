@@ -1,11 +1,11 @@
-// A number over time, as a line; the step that is shown is marked.
+// Draws a number over time as a line, and marks the step that is shown.
 
 import { el, svg } from "./dom.js";
 
 const [WIDE, HIGH] = [300, 70];
 
 export class Chart {
-  /** name: what it is; told: how a value is written. zero: whether the line of zero is always in sight. */
+  /** name: of the number. told: writes a value. zero: whether zero is always in the picture. */
   constructor(name, told, zero = true) {
     this.told = told;
     this.zero = zero;

@@ -16,7 +16,7 @@ export const el = (tag, attributes = {}, ...children) => made(document.createEle
 export const svg = (tag, attributes = {}, ...children) =>
   made(document.createElementNS(SVG, tag), attributes, children);
 
-/** Told to those who hear the page. */
+/** Says a text to people who use a screen reader. */
 export function say(text) {
   document.getElementById("said").textContent = text;
 }
@@ -24,14 +24,14 @@ export function say(text) {
 /** An error as the page shows it. */
 export const problem = (error) => el("p", { class: "problem", role: "alert" }, error.told?.() ?? error.message);
 
-/** A share; 0 % and 100 % are none and all of it, as far as sums of shares are exact. */
+/** A share as text; only none and all of it are 0 % and 100 %, up to rounding errors of sums. */
 export function percent(share) {
   if (share > 0 && share < 0.001) return "<0.1 %";
   if (share >= 0.995 && share < 1 - 1e-9) return share > 0.999 ? ">99.9 %" : `${(100 * share).toFixed(1)} %`;
   return `${(100 * share).toFixed(share > 0.0995 ? 0 : 1)} %`;
 }
 
-/** A number, in a unit where one is told. */
+/** A number as text, with a unit if there is one. */
 export function amount(value, unit = "") {
   if (value === null || value === undefined) return "–";
   if (Math.abs(value) > 1e6) return value > 0 ? "∞" : "−∞";
@@ -40,10 +40,10 @@ export function amount(value, unit = "") {
 
 export const metres = (value) => amount(value, " m");
 
-/** Both ends of a long id: those of a fleet often differ in the last letters alone. */
+/** Both ends of a long id, since the ids of a fleet often differ only in the last letters. */
 export const short = (id) => (id.length > 24 ? `${id.slice(0, 11)}…${id.slice(-11)}` : id);
 
-/** A named thing by its name. */
+/** The name of a thing, or else its short id. */
 export const called = (thing) => thing.name ?? short(thing.id);
 
 export const button = (text, onclick, more = {}) => el("button", { type: "button", onclick, ...more }, text);
@@ -52,8 +52,8 @@ export const button = (text, onclick, more = {}) => el("button", { type: "button
 export const pair = (name, ...value) => [el("dt", {}, name), el("dd", {}, ...value)];
 
 /**
- * One child of `parent` for each item, in their order. A child stays while its item does, so that it keeps the
- * keyboard. key: of an item; make: a child for one; fill: writes into a child what may have changed.
+ * Gives `parent` one child for each item, in order. A child stays as long as its item, so that it keeps the focus.
+ * key: returns the key of an item. make: makes its child. fill: writes into a child what may have changed.
  */
 export function keep(parent, items, { key, make, fill }) {
   const before = new Map([...parent.children].map((child) => [child.dataset.key, child]));
@@ -68,12 +68,12 @@ export function keep(parent, items, { key, make, fill }) {
   now.forEach((child, i) => child !== parent.children[i] && parent.insertBefore(child, parent.children[i] ?? null));
 }
 
-/** Writes a text where it is another. */
+/** Writes a text into an element if the element has another one. */
 export function write(element, text) {
   if (element.textContent !== String(text)) element.textContent = text;
 }
 
-/** Calls `work` once after the last call, `wait` milliseconds later. */
+/** A function that calls `work` once, `wait` milliseconds after the last of its own calls. */
 export function later(work, wait) {
   let timer = 0;
   return (...given) => {
@@ -82,7 +82,7 @@ export function later(work, wait) {
   };
 }
 
-/** At most one call of `draw` for each picture on the screen. */
+/** A function that calls `draw` at most once for each frame of the screen. */
 export function onceAFrame(draw) {
   let asked = false;
   return () => {

@@ -41,7 +41,7 @@ function middle(part) {
 export const bare = (name) => name.replace(/^\w+\((.*)\)$/, "$1");
 
 export class Floor {
-  /** map: as the API shows it. label: for those who do not see it. */
+  /** map: as the API shows it. label: for people who do not see the picture. */
   constructor(map, label) {
     const [x0, y0, x1, y1] = map.bounds;
     this.map = map;

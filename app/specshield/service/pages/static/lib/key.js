@@ -1,11 +1,11 @@
-// The key that this tab was given, and the dialog that asks for it.
+// The API key that was entered in this tab, and the dialog that asks for it.
 
 const KEY = "specshield-key";
 let asking = null;
 
 export const key = () => sessionStorage.getItem(KEY);
 
-/** Shows the dialog until a key is given; all who wait for one share it. */
+/** Shows the dialog until a key is entered. All callers that wait for a key share it. */
 export function askForKey(wrong) {
   asking ??= new Promise((done) => {
     const dialog = document.getElementById("key");
@@ -17,7 +17,7 @@ export function askForKey(wrong) {
       asking = null;
       done();
     };
-    // A browser closes it for who presses Escape twice, whatever a page says; without a key nothing can be shown.
+    // A browser closes the dialog when Escape is pressed twice; it opens again, as nothing can be shown without a key.
     dialog.onclose = () => asking && !dialog.open && dialog.showModal();
     dialog.showModal();
   });

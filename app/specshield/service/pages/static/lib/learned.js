@@ -1,4 +1,4 @@
-// What a session has learned of its map: the cells that it found otherwise than they are on the map, drawn over it.
+// What a session has learned of its map: draws the cells that it found to differ from the map.
 
 import { ask } from "./api.js";
 import { el, svg } from "./dom.js";
@@ -8,13 +8,13 @@ export const EVERY = 1000; // [ms] between two reads, at least: a robot with a s
 
 export class Learned {
   /**
-   * session: as the API shows it. mark: of its robot. changed: called when other cells are to be drawn.
-   * name: of the robot, where the floor has several. every: milliseconds between two reads.
+   * session: as the API shows it. mark: of its robot. changed: called when the cells have changed.
+   * name: of the robot, if the floor has several. every: milliseconds between two reads.
    */
   constructor(floor, session, mark, changed, name = "", every = EVERY) {
     Object.assign(this, { floor, session, mark, changed, name, every });
     const { rules, map_id } = session;
-    this.since = rules[rules.findLastIndex((rule) => rule.map_id !== map_id) + 1].from; // it has been on this map
+    this.since = rules[rules.findLastIndex((rule) => rule.map_id !== map_id) + 1].from; // its first step on this map
     this.known = { t: -1, map_revision: 0, occupied: [], free: [] };
     this.newest = 0; // revision of the map at the newest decision
     const { origin, resolution } = floor.map;
@@ -25,7 +25,7 @@ export class Learned {
     this.key = el("p", { class: "key learned", hidden: true });
   }
 
-  /** Takes note of a decision, and reads what it has learned; until `signal` ends. */
+  /** Notes a decision, and reads what the session has learned if that has changed. */
   async heard({ t, decision }, signal) {
     if (t >= this.since) this.newest = decision.map_revision;
     if (this.reading) return;
@@ -34,12 +34,12 @@ export class Learned {
       while (this.known.map_revision < this.newest) {
         const path = `v1/sessions/${encodeURIComponent(this.session.id)}/learned`;
         const known = await patiently(() => ask(path, { signal }), signal);
-        if (known.map_id !== this.session.map_id) return; // it has been switched to another, and is shown anew
+        if (known.map_id !== this.session.map_id) return; // after a switch to another map, the view begins again
         this.take(known);
         await pause(this.every);
       }
     } catch (error) {
-      if (!signal.aborted && error.status !== 404) throw error; // else it was left, or erased, as others say
+      if (!signal.aborted && error.status !== 404) throw error; // else the view was left, or the session erased
     } finally {
       this.reading = false;
     }

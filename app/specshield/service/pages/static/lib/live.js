@@ -1,17 +1,17 @@
-// What happens to sessions, as it happens. A page that nobody sees keeps no connection: a browser has six.
+// Follows sessions while they are stepped. A hidden page closes its connection, since a browser has only six.
 
 import { ask, events } from "./api.js";
 import { passes, pause } from "./patience.js";
 
 const AGAIN = 500; // [ms] before a stream that ended is asked for again
-const SILENT = 40_000; // [ms] without a word after which a connection is lost: the server sends something every 15 s
+const SILENT = 40_000; // [ms] of silence after which a connection counts as lost: the server sends a comment every 15 s
 
 /**
- * Calls `take` with each item of these sessions, and at the end of one with {session, finished: true}, which has
- * `erased: true` where the session is no longer there, and `anew: true` where another has its id by now.
- * after: Map of id to the last step that is known, -1 for none; it is kept up to date. created: Map of id to the
- * session's `created_at`.
- * connected: called with true when the stream is there, and with false when it is lost; it is asked for again.
+ * Calls `take` with each item of these sessions, and at the end of a session with {session, finished: true}, also
+ * with `erased: true` if the session no longer exists, and `anew: true` if another session has its id now.
+ * after: Map of id to the last known step, -1 for none; it is kept up to date. created: Map of id to the session's
+ * `created_at`.
+ * connected: called with true when the stream is open, and with false when it is lost and opened again.
  */
 export async function follow(after, created, take, connected, signal) {
   const end = (item) => {
@@ -19,7 +19,7 @@ export async function follow(after, created, take, connected, signal) {
     take(item);
   };
   const fate = (id, signal) => become(id, created.get(id), signal);
-  let doubted = false; // whether a stream has ended: since then the sessions may have been erased
+  let doubted = false; // whether a stream has ended, so that sessions may have been erased since
   while (after.size && !signal.aborted) {
     await seen(signal);
     const line = new Line(signal);
@@ -53,7 +53,7 @@ export async function follow(after, created, take, connected, signal) {
   }
 }
 
-/** Its signal ends a stream when the page is left or hidden, and when nothing was heard for too long. */
+/** A connection whose signal ends it when the view is left, the page is hidden, or it is silent for too long. */
 class Line {
   constructor(leaving) {
     this.stop = new AbortController();
@@ -74,11 +74,11 @@ class Line {
   close() {
     clearTimeout(this.timer);
     document.removeEventListener("visibilitychange", this.hide);
-    this.stop.abort(); // what is left of a stream that is no longer read
+    this.stop.abort(); // ends a stream that is not read to its end
   }
 }
 
-/** What has become of a session: {} where it is there, else `erased`, with `anew` where another has its id. */
+/** Whether a session still exists: {} if so, else {erased: true}, with `anew: true` if another has its id. */
 async function become(id, created, signal) {
   try {
     const session = await ask(`v1/sessions/${encodeURIComponent(id)}`, { signal });

@@ -19,11 +19,11 @@ export class Mark {
     this.body = svg("g", { class: `robot ${color}`, hidden: true }, svg("title", {}, id), this.disc, this.nose);
     floor.layers.ways.append(this.next, this.way);
     floor.layers.robots.append(this.body);
-    this.occupancy = null; // of its session's own map, where that is another
+    this.occupancy = null; // the cells of the session's own map, if it differs from the map
     this.fits = (point, radius) => (this.occupancy ?? floor.occupancy)?.fits(point, radius) ?? true;
   }
 
-  /** items: of the trajectory up to the one that is shown. What was on another floor, before a switch, is not drawn. */
+  /** items: of the trajectory, up to the step that is shown. Steps on another floor, before a switch, are left out. */
   show(items) {
     const last = items.at(-1);
     if (!last) return;

@@ -1,4 +1,4 @@
-// The robot's motions, for what is drawn. What counts is simulated by the server.
+// The robot's motions, only for drawing: decisions rest on the server's simulation.
 
 const STRIDE = 0.05; // [m] between two looks at the walls
 
@@ -11,7 +11,7 @@ export function centre(robot, [x, y, theta]) {
   return [x + c * ahead - s * left, y + s * ahead + c * left];
 }
 
-/** The pose after an action, stopped or held back by what `fits` says does not fit. */
+/** The pose after an action; a move to where the robot does not fit is stopped there, or not made at all. */
 export function after(robot, pose, action, fits) {
   const { translate, rotate } = robot.actions[action];
   const [x, y, theta] = pose;

@@ -1,6 +1,6 @@
-// The line above every view: what there is to know of the server.
+// The line above every view, with news about the server.
 
-/** An empty text takes the line away. */
+/** Writes the line; an empty text removes it. */
 export function notice(text) {
   const place = document.getElementById("server");
   if (place.textContent !== text) place.textContent = text; // else it would be read aloud again

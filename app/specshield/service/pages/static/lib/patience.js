@@ -1,18 +1,18 @@
-// How the page lasts through times when the server is away: it asks again, and says so.
+// Asks again while the server is away, and says so on the page.
 
 import { answeredAt, Problem } from "./api.js";
 import { problem } from "./dom.js";
 import { notice } from "./notice.js";
 
-const AGAIN = 2000; // [ms] before it is asked again
-const LONGEST = 60_000; // [ms] for one look; chosen by hand: a server that is cut off may seem to be busy for ever
+const AGAIN = 2000; // [ms] before it asks again
+const LONGEST = 60_000; // [ms] for one look; chosen by hand: a connection that was cut off may stay silent for ever
 
 export const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
-/** Whether waiting may mend it: the server did not answer, has trouble of its own, or is asked too often. */
+/** Whether waiting may help: the server did not answer, had an error, or got too many requests. */
 export const passes = (error) => error instanceof Problem && (!(error.status < 500) || [408, 429].includes(error.status));
 
-/** What `work` gives, as soon as the server answers. */
+/** The result of `work`, which is repeated until the server answers. */
 export async function patiently(work, signal) {
   for (;;) {
     try {
@@ -33,8 +33,8 @@ function trouble(error) {
 }
 
 /**
- * Calls `look`, with a signal that also ends what takes too long, every `wait` milliseconds while the page is
- * seen. What waiting cannot mend ends it, and is told in `place`.
+ * Calls `look` every `wait` milliseconds while the page is visible, with a signal that also ends a look that takes
+ * too long. An error against which waiting does not help ends this, and is shown in `place`.
  */
 export async function again(look, wait, place, signal) {
   try {

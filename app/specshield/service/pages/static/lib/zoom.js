@@ -1,12 +1,12 @@
-// What part of a floor is seen: by wheel, two fingers, buttons and keys. At first all of it.
+// Chooses the part of a floor that is seen, by wheel, two fingers, buttons and keys. At first all of it is seen.
 
 import { button, el } from "./dom.js";
 
-const STEP = 1.4; // from one press of a button or key to the next; chosen by hand
-const MOST = 40; // times, and as many more as a narrow floor needs to be as wide as its frame
-const NARROWEST = 3; // times that a frame is as long as it is wide, however narrow the floor is
-const FINE = 1.0015; // a pixel of the wheel
-const SLIPPED = 4; // [px] that a click may move
+const STEP = 1.4; // factor for each press of a button or key; chosen by hand
+const MOST = 40; // the largest factor, unless a narrow floor needs more to be as wide as its frame
+const NARROWEST = 3; // the largest ratio of a frame's sides, however narrow the floor is
+const FINE = 1.0015; // factor for each pixel of the wheel
+const SLIPPED = 4; // [px] that the pointer may move during a click
 const UNIT = [5, 7]; // [px] the least and the most that `--unit`, a hundredth of the picture, becomes on the screen
 
 export class Zoom {

@@ -1,4 +1,4 @@
-// One episode of a simulated robot, step by step through the API, as any robot's program does it.
+// One episode of a simulated robot, driven step by step by the API, as a robot's program does it.
 
 import { ask } from "../lib/api.js";
 import { passes } from "../lib/patience.js";
@@ -17,7 +17,7 @@ export class Episode {
     if (this.settled) await this.close();
   }
 
-  /** A step that was not answered may have been decided: it is sent again as it was. */
+  /** Decides a step. A step without an answer may have been decided, so it is sent again without changes. */
   async decide() {
     const { session, world, t } = this;
     this.sent ??= this.next();
@@ -35,13 +35,13 @@ export class Episode {
     const ends = session.terminal_actions.includes(decision.action);
     if (ends) this.ended = true;
     const action = ends ? decision.completion_action : decision.action;
-    const pushed = world.pose !== pose; // meanwhile: it is not where the action would have begun
+    const pushed = world.pose !== pose; // meanwhile, so that the action would begin at another pose
     if (action !== null && !pushed) world.execute(decision.next_poses[action]);
     this.t += 1;
     this.settled = decision.spec_status === "satisfied" || t >= session.horizon || decision.finished || (ends && action === null);
   }
 
-  /** What is sent for step t: what the robot sees and its model wants now. */
+  /** The request for step t: what the robot sees and what its model wants now. */
   next() {
     const { pose } = this.world;
     const seen = this.world.seen();

@@ -1,5 +1,5 @@
-// What was asked and answered at one step: the mode in words, and for each action what the model wanted of it,
-// what it got, and whether the rule can still be kept after it.
+// The decision of one step: its mode in words, and for each action the probability that the model wanted, the
+// probability that it got, and whether the rule can still be kept after it.
 
 import { el, metres, pair, percent } from "../lib/dom.js";
 import { measure, ruleOf, sameFloor, sameRobot, within } from "../lib/rules.js";

@@ -1,4 +1,4 @@
-// The policies there are, and how far those are that are being made.
+// The list of policies, with the progress of those that are being made.
 
 import { all } from "../lib/api.js";
 import { called, el, keep, percent, write } from "../lib/dom.js";

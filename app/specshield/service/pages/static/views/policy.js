@@ -1,4 +1,4 @@
-// One policy: how far it is, and from where its rule can be kept.
+// One policy: the progress of its making, and the starts from which its rule can be kept.
 
 import { ask, picture } from "../lib/api.js";
 import { called, el, pair, percent, problem, say } from "../lib/dom.js";

@@ -1,4 +1,4 @@
-// Which step is shown: the newest as it comes, or any from before, by a slider or played.
+// Chooses the step that is shown: always the newest one, or an earlier one by a slider or by playing.
 
 import { button, el } from "../lib/dom.js";
 

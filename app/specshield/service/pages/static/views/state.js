@@ -1,4 +1,4 @@
-// Whether what is shown of robots is live, in one line: a robot that cannot be heard is not one at rest.
+// A line that says whether the view is live, so that a lost connection does not look like a robot at rest.
 
 import { el, write } from "../lib/dom.js";
 

@@ -1,4 +1,4 @@
-// A simulated robot with a policy: it is set down, driven by a stand-in model, pushed, and met by obstacles.
+// A simulated robot with a policy: a stand-in model drives it, and one can push it and put obstacles in its way.
 
 import { ask } from "../lib/api.js";
 import { button, called, el, svg } from "../lib/dom.js";

@@ -1,4 +1,4 @@
-// One robot: its floor, what it was answered at the step that is shown, and what came before.
+// One robot: its floor, the decision at the step that is shown, and charts of the steps so far.
 
 import { ask } from "../lib/api.js";
 import { Chart } from "../lib/chart.js";
