@@ -1,4 +1,4 @@
-"""Simple methods, made of the shield's own parts, that might do as well as it does.
+"""Simple methods, made of parts of the shield, that might do as well as the shield.
 
 rule-first   the rule before the task: the certified continuation until the rule is decided, then the model
 visits-first the certified continuation until what is to be visited was, then the shield

@@ -1,4 +1,4 @@
-"""Margins that are measured: the method NAME@conformal/K becomes NAME@M/K, M metres from a calibration."""
+"""Measured margins: the method NAME@conformal/K becomes NAME@M/K, with M metres from a calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands that this package adds to `specshield`; each imports what it needs when it runs."""
+"""The commands that this package adds to `specshield`. Each imports what it needs when it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Curves: what a threshold below 1, or a real-valued J, keeps of the rule, and what it costs the model."""
+"""Curves: how often the rule is kept with thresholds below 1 or with a real-valued J, and at what cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SafeDec's constrained decoding: the logits are changed by what one step leads to (Kapoor et al., 2025).
+"""SafeDec's constrained decoding changes the logits by the state after one step (Kapoor et al., 2025).
 
     HCD   logit_a = -inf                                  where f(x_t, a) itself violates
     RCD   logit_a = logit_a + beta exp(alpha rho(f(x_t, a)))

@@ -1,4 +1,4 @@
-"""A world that is not quite what the shield was told.
+"""Worlds that differ from what the shield was told.
 
     none        as told
     gaussian    every motion ends off by sigma 0.01 m along x and y and 0.5 degrees, as in SPOC's stochastic

@@ -1,4 +1,4 @@
-"""Does it matter how close the answer stays to the model? Two models, and what of theirs a shield may break.
+"""Does it matter how close the answer stays to the model? Two models with habits that a shield may break.
 
 courteous   near people it moves at every second step at most: at what share of the steps there this is broken
 follower    it was told its way, and remembers its recent steps: how often it loses its way, and what it costs

@@ -1,4 +1,4 @@
-"""Houses as cases: a rule over rooms by their names, and something to find in another room.
+"""Houses as cases: a rule over named rooms, and something to find in another room.
 
 `drawn_N` is a floor plan of our own making, drawn with the seed N (model/floor_plans.py), 7.5 to 12 m wide
 and deep; `large_N` is one of 15 x 12 m, with more rooms than the learned models practised in. Real ones are

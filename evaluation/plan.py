@@ -1,4 +1,4 @@
-"""What `make results` runs, the most telling first: it may be stopped at any time, and taken up again."""
+"""The experiments of `make results`, the most important first: it may be stopped and continued."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How early the rule's visits are asked for, where it is not a fixed number of steps: look-ahead's rivals.
+"""Rivals of look-ahead: slacks that are not a fixed number of steps.
 
 proportional   K per cent of the rule's shortest window
 adaptive       between no slack and K steps, by how much of the model's mass was infeasible lately

@@ -1,4 +1,4 @@
-"""The pages of results, from what `specshield evaluate --out` has kept.
+"""Writes the pages of results from the files of `specshield evaluate --out`.
 
 Every figure in the pages is read from a results.json; the words around them are in pages/words.py. The page
 asked for summarises; the others lie in a folder beside it, in which other commands write pages too.

@@ -1,4 +1,4 @@
-"""Random apartments: rooms cut from a rectangle, doors, furniture, and things in the places they are kept."""
+"""Random apartments: rooms cut from a rectangle, doors, furniture, and things in their usual places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a model without a shield finds what it is sent for: figures for the learned model's card."""
+"""Measures how often a model without a shield finds its target: figures for the learned model's card."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A goal-seeker with a habit that matters to people: near a person it moves at every second step at most.
+"""A goal-seeker with a habit that matters to people: near a person it moves at most at every second step.
 
 There is a person in the middle of each room. The habit is in the model's logits alone: no rule asks for it.
 """

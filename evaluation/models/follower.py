@@ -1,4 +1,4 @@
-"""A model that is told its way at the start, and remembers only its recent steps: a long detour breaks it.
+"""A model that gets its way at the start and remembers only its recent steps, so that a long detour fails it.
 
 Its way is the shortest along free space from where it starts. It knows how far along it is as long as it left
 it no more than MEMORY steps ago. After that it is lost, for good: then it picks waypoints in what it sees, as

@@ -1,4 +1,4 @@
-"""A model that is sent for things in order, made of models that are each sent for one.
+"""A model that has to find things in order, made of models that have to find one thing each.
 
 Each says `end` where it believes to have found its thing. Before the last thing the token `sub_done` takes
 the place of `end`: where it was meant and is executed, the next model takes over, with an empty memory.

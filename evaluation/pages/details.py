@@ -1,4 +1,4 @@
-"""Pages with experiments one by one, each with its table and, where there are any, its pictures."""
+"""Pages with experiments one by one, each with its table and, if it has any, its pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of worlds that are not as the shield was told."""
+"""The page of worlds that differ from what the shield was told."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/results.md, in three screens: a table a case, what it is less than it may sound, where the rest is."""
+"""docs/results.md, on three screens: a table for each case, its caveats, and links to the other pages."""
 
 from __future__ import annotations
 

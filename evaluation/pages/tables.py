@@ -1,4 +1,4 @@
-"""What all pages share: a row a method with intervals, how a method does beside `ours`, and the commands."""
+"""What all pages share: one row for each method with intervals, comparisons with `ours`, and the commands."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Worlds that are not as told: how much of what an oracle could keep is kept by a session that learns."""
+"""Worlds that differ from the description: what a session that learns keeps of what an oracle could."""

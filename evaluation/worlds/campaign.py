@@ -1,4 +1,4 @@
-"""Runs in worlds that are not as told, spread over processes and kept in a file each, and a table of them."""
+"""Runs in worlds that differ from the description, in several processes, a file for each, and their table."""
 
 from __future__ import annotations
 

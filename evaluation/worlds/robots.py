@@ -1,4 +1,4 @@
-"""Robots that worlds are tried with beside the Stretch. None of these has a motion backwards.
+"""Robots beside the Stretch with which worlds are tried. None of them can move backwards.
 
 locobot    as in the tasks of Habitat and AI2-THOR: 0.25 m ahead and turns of 30 degrees, a centred footprint
 trailing   the same, with its footprint 0.08 m behind its origin, so that its turns need room

@@ -1,4 +1,4 @@
-"""One run in a world that is not as told: a session that learns, beside an oracle that was told all."""
+"""One run in a world that differs from the description: a session that learns, beside an oracle."""
 
 from __future__ import annotations
 

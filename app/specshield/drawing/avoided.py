@@ -1,4 +1,4 @@
-"""What a rule says of its regions: to visit, or to avoid."""
+"""Which regions a rule asks to visit, and which to avoid."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from specshield.stl import BODY_WORDS, Formula, Implies, Not, body_name
 
 
 def is_avoided(formula: Formula, region: str) -> bool:
-    """Whether the formula asks that the robot be not in this region, or not touch it."""
+    """Whether the formula asks the robot not to be in this region, or not to touch it."""
     return bool(avoided(formula) & {region, *(body_name(how, region) for how in BODY_WORDS)})
 
 

@@ -1,4 +1,4 @@
-"""What a picture draws as lines: regions, and the way ahead."""
+"""The lines of a picture: the outlines of regions, and the way ahead."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from specshield.robot.dynamics import make_body, step
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Circle, Polygon, Rectangle, Region, Union
 
-CORNERS = 48  # of the polygon that a circle is drawn as
+CORNERS = 48  # of the polygon that is drawn for a circle
 
 
 def outlines(region: Region) -> list[Floats]:
@@ -38,8 +38,8 @@ def way_ahead(
     completion: int | None,
     witness: Sequence[int] | None,
 ) -> Floats:
-    """The certified continuation of a decision as poses [n, 3], the first of them `pose`, x_t; no other where
-    there is none. action, completion, witness: as the answer has them.
+    """The certified continuation of a decision as poses [n, 3], the first of them `pose`, x_t, which is the
+    only one if there is no continuation. action, completion, witness: members of the answer.
     """
     chosen, poses = completion if robot.terminal[action] else action, [pose]
     if witness is not None and chosen is not None:

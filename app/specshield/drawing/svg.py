@@ -1,8 +1,8 @@
 """A floor plan as SVG: walls, a heat map, regions, ways, robots, text. Points are in metres, map frame.
 
-In the picture they count from the map's lower left corner: what draws an SVG keeps some seven digits of a
-number, and a map may lie millions of metres from its frame's origin. The picture stands alone: no script, no
-font or image from elsewhere. It is dark where its reader's screen is.
+The picture's coordinates count from the map's lower left corner, since viewers of SVG keep about seven digits
+of a number, and a map may be millions of metres from its frame's origin. The picture needs no script, font or
+image from elsewhere. It has dark colours on a screen with a dark theme.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from specshield.task import Task
 from specshield.world.learned import NONE, LearnedMap
 from specshield.world.regions import Circle, Region, Union
 
-# Widths are in thousandths of the longer side of the map, so that every map looks alike.
+# Widths are in thousandths of the map's longer side, so that all maps look alike.
 STYLE = """
 .paper{fill:#faf9f6}.ink{fill:#282b32}.faint{fill:#6d7078}
 .visit{fill:#2b8a5a;stroke:#2b8a5a}.avoid{fill:#c63c3c;stroke:#c63c3c}
@@ -39,15 +39,15 @@ text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospac
 .name{stroke:none;font-weight:600}
 """
 
-# Of a text below the map, in thousandths of the map's longer side: a letter's height and width, a line's.
+# For text below the map: height and width of a letter, height of a line [1/1000 of the map's longer side].
 SIZE, LETTER, LINE = 24, 0.62 * 24, 36
-FOUND = 0x70, 0x40, 0xA8  # the colour of cells that were found occupied, and of those found free at a third
+FOUND = 0x70, 0x40, 0xA8  # the colour of cells that were found occupied; cells found free have a third of it
 WIDTHS = {"way": 6, "beside": 4, "after": 4, "next": 3}  # of ways, by kind
-FEWEST = 30  # letters a line: below a narrower map the picture is as wide as its text
+FEWEST = 30  # letters in a line, for which the picture of a narrow map becomes wider
 
 
 class Plan:
-    """Collects the parts of a picture; `svg` gives it. title: for those who cannot see it."""
+    """Collects the parts of a picture, which `svg` returns. title: for people who cannot see the picture."""
 
     def __init__(self, task: Task, title: str) -> None:
         self._task, self._title = task, title
@@ -58,11 +58,11 @@ class Plan:
         self._lines: list[tuple[str, str]] = []  # (kind, text)
 
     def walls(self, known: LearnedMap = NONE) -> None:
-        """One pixel a cell, turned as the map's origin is. known: what a session found otherwise."""
+        """Draws one pixel for each cell, turned by the map's yaw. known: cells that a session has learned."""
         grid = self._task.grid
         kind = grid.occupied.astype(np.uint8)
         kind.ravel()[known.cell] = np.where(known.occupied, 2, 3)
-        image = Image.fromarray(kind[::-1])  # 16 million in 0.6 s, as one bit each
+        image = Image.fromarray(kind[::-1])  # 16 million cells take 0.6 s, with one bit each
         image.putpalette([0, 0, 0, 0x34, 0x38, 0x40, *FOUND, *FOUND])
         x, y, yaw = grid.origin
         right, down = self._at(x, y)
@@ -72,7 +72,7 @@ class Plan:
         self._image(image, box, how, bits=2 if len(known) else 1, transparency=b"\0\xff\xff\x55")
 
     def heat(self, share: Floats) -> None:
-        """share [rows, columns], the first row at the highest y: 0 to 1, NaN where nothing is known."""
+        """Draws share [rows, columns], the first row at the highest y: 0 to 1, NaN where it is unknown."""
         known = np.isfinite(share)
         value = np.where(known, share, 0.0)[..., None]
         none, all_ = np.array([214.0, 84, 66]), np.array([43.0, 138, 90])
@@ -81,7 +81,7 @@ class Plan:
         self._image(Image.fromarray(pixels), box, 'preserveAspectRatio="none"')
 
     def regions(self) -> None:
-        """Those that the rule names, each with its name."""
+        """Draws the regions that the rule names, each with its name."""
         for name, region in self._task.regions.items():
             kind = "avoid" if is_avoided(self._task.formula, name) else "visit"
             self._parts.append(f'<g class="region {kind}" stroke-width="{2 * self._unit:g}">')
@@ -94,8 +94,8 @@ class Plan:
             )
 
     def way(self, poses: Floats, kind: str = "way") -> None:
-        """kind: `way` for what was driven, `beside` for another way, `after` for what the rule is no longer
-        about, `next` for what would follow.
+        """Draws poses [n, 3] as a line. kind: `way` for the way driven, `beside` for another one, `after` for
+        the part after the rule's end, `next` for the certified continuation.
         """
         points = self._points(np.asarray(poses)[:, :2].tolist(), ".3f")
         dashes = f' stroke-dasharray="{6 * self._unit:g} {6 * self._unit:g}"' if kind == "next" else ""
@@ -103,8 +103,8 @@ class Plan:
         self._parts.append(f'<polyline class="{kind}" points="{points}" stroke-width="{wide:g}"{dashes}/>')
 
     def robot(self, pose: Sequence[float], kind: str = "robot") -> None:
-        """Its footprint, and a line from its origin to where it looks. kind: `robot body` for outlines alone,
-        of which there may be many.
+        """Draws the robot's footprint, and a line from its origin along its heading. kind: `robot body` draws
+        only outlines, of which there may be many.
         """
         theta, robot = pose[2], self._task.robot
         cos, sin, (ahead, left) = math.cos(theta), math.sin(theta), robot.offset
@@ -117,7 +117,7 @@ class Plan:
         )
 
     def mark(self, point: Sequence[float], said: str, kind: str = "mark", above: bool = False) -> None:
-        """A dot, and words below or `above` it. kind: `mark`, or `target` for a larger dot."""
+        """Draws a dot, with a text below or `above` it. kind: `mark`, or `target` for a larger dot."""
         x, y = self._at(point[0], point[1])
         dot, edge = (12 if kind == "target" else 8) * self._unit, 2 * self._unit
         self._parts.append(
@@ -126,11 +126,11 @@ class Plan:
         )
 
     def words(self, point: Sequence[float], said: str) -> None:
-        """At a point of the map."""
+        """Writes a text at a point of the map."""
         self._parts.append(self._text(*self._at(point[0], point[1]), said, 20, "faint", "middle"))
 
     def line(self, said: str, kind: str = "ink") -> None:
-        """A line of text below the map; a long one goes on in the next."""
+        """Writes a line of text below the map; a long text is continued in further lines."""
         most = max(int(self._wide / self._unit / LETTER), FEWEST)
         while said:
             cut = len(said) if len(said) <= most else said.rfind(" ", 0, most)
@@ -161,7 +161,7 @@ class Plan:
         ).encode()
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
-        """A point of the map in the picture, whose y goes down."""
+        """The picture's coordinates of a point of the map: the picture's y points down."""
         return x - self._xmin, self._ymin - y
 
     def _points(self, points: Iterable[Sequence[float]], digits: str) -> str:

@@ -1,4 +1,4 @@
-"""The windows of a rule on the time line: when each of its temporal operators is looked at."""
+"""The windows of a rule on the time line: the steps at which its temporal operators look."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ LETTERS: dict[type[Formula], str] = {Always: "G", Eventually: "F", Until: "U"}
 
 
 class Window(NamedTuple):
-    """begin, end: the first and last step [steps from the session's start] that `formula` looks at.
-
-    operator: G, F or U. depth: how many other windows it lies in.
+    """operator: G, F or U. begin, end: the first and the last step at which `formula` may look, from the
+    rule's origin on. depth: the number of other windows that contain this one.
     """
 
     operator: str
@@ -24,7 +23,7 @@ class Window(NamedTuple):
 
 
 def windows(formula: Formula, begin: int = 0, end: int = 0, depth: int = 0) -> Iterator[Window]:
-    """Outermost first. An operator inside another one counts from each step of the outer window.
+    """The windows, outermost first. An operator inside another one counts from each step of the outer window.
 
     >>> from specshield.stl import parse
     >>> [(w.operator, w.begin, w.end) for w in windows(parse("F[2,5] G[0,3] a and G[0,9] b"))]
@@ -37,5 +36,5 @@ def windows(formula: Formula, begin: int = 0, end: int = 0, depth: int = 0) -> I
         depth += 1
         inner = begin if not isinstance(formula, Until) else begin - formula.a
     for i, part in enumerate(formula.parts):
-        if isinstance(part, Formula):  # the left of an `until` is looked at from the start of its window on
+        if isinstance(part, Formula):  # the left side of an `until` holds from t on, not from t + a
             yield from windows(part, inner if i == 0 else begin, end, depth)

@@ -1,4 +1,4 @@
-"""The shield inside what people already run. Each module needs the package that it is named after.
+"""The shield inside other programs. Each module needs the package of the same name.
 
-They take a `specshield.local.LocalSession` or a session of the SDK: both have the same `step`.
+They take a `specshield.local.LocalSession` or a session of the SDK, which have the same `step`.
 """

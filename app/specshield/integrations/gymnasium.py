@@ -1,16 +1,16 @@
-"""A gymnasium environment with discrete actions that is kept inside a rule.
+"""Keeps a gymnasium environment with discrete actions inside a rule.
 
     env = ShieldWrapper(gymnasium.make(...), shield, pose_of)
     observation, info = env.reset(seed=0)
     action = rng.choice(env.action_space.n, p=info["distribution"])
     observation, reward, terminated, truncated, info = env.step(action)
 
-`info["action_mask"]` says which actions can be followed by a way to keep the rule, and `info["distribution"]`
-is the model's own, shaped. An action that has no probability there is not executed: the one that the shield
-drew is, and `info["executed"]` says which. A rule often looks further than the task. So where the environment
-terminates while the rule is pending, the episode goes on, without reward, along the certified continuation,
-until the rule is decided; the environment has to take steps after it has terminated, and its time limit has
-to lie beyond the rule's horizon.
+`info["action_mask"]` says after which actions the rule can still be kept, and `info["distribution"]` is the
+model's distribution, shaped. If an action without probability there is asked for, the action that the shield
+drew is executed instead; `info["executed"]` says which one was. A rule often looks further than the task. So
+if the environment terminates while the rule is pending, the episode goes on without reward along the
+certified continuation until the rule is decided. The environment has to take steps after it has terminated,
+and its time limit has to be later than the rule's horizon.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """`env` inside the rule of a shield.
 
-    shield: one, or what makes one for an environment that was just reset, where each episode has a map of its
-    own. pose_of: (x, y, theta) in the map's frame. logits: the model's, one an action, for an observation and
-    the action that was executed before it (None at first), which many models are fed; by default every action
-    is alike. possible: which actions may be taken at all, [A] booleans, where the dynamics that the shield
-    knows do not tell all. settings: as of `LocalShield.session`; by default the environment moves exactly as
-    the shield's robot. Each episode has its own seed, made of the one in `settings` and the one of `reset`.
+    shield: a shield, or if each episode has its own map, a function that makes one for an environment that
+    was just reset. pose_of: returns (x, y, theta) in the map's frame. logits: returns the model's logits, one
+    for each action, for an observation and the action executed before it (None at first); by default all
+    actions are alike. possible: returns booleans [A], which actions are possible at all, if the shield's
+    dynamics do not show that. settings: of `LocalShield.session`; by default the environment moves exactly
+    like the shield's robot. Each episode has its own seed, made from the seeds of `settings` and of `reset`.
 
-    Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
-    the rule cannot be kept, and InputError at `step` for an action that there is not. Raises InputError too
-    for a seed that is no whole number, at once, and where `possible` does not give A booleans.
+    Raises InputError at once for a seed that is no whole number. `reset` raises RobotError unless the actions
+    are numbered like the robot's, and InfeasibleStart if the rule cannot be kept. `step` raises InputError
+    for an action that does not exist. Both raise InputError if `possible` does not return A booleans.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         except (TypeError, ValueError):
             got, expected = self._settings["seed"], "a whole number, 0 or more"
             raise InputError("this is no seed", path="seed", got=got, expected=expected) from None
-        self._since = [0, -1]  # the last seed that `reset` was given, and the episodes since
+        self._since = [0, -1]  # the last seed given to `reset`, and the number of episodes since then
         self.session: LocalSession | None = None
         self.decision: Decision | None = None
 
@@ -114,7 +114,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     def _decide(
         self, session: LocalSession, observation: Any, executed: int | None, over: bool
     ) -> dict[str, Any]:
-        """Ask the shield about the state that the environment is in; what of it goes into `info`."""
+        """Decides the step from the environment's state, and returns the members for `info`."""
         logits = np.zeros(len(session.info.actions))
         if self._logits is not None and not over:
             told = logit_values(self._logits(observation, executed))

@@ -1,11 +1,11 @@
-"""A LeRobot policy inside a rule, in the place where its `select_action` is called.
+"""A LeRobot policy inside a rule, with the same `select_action`.
 
     shielded = ShieldedPolicy(policy, shield, row_of)
     action = shielded.select_action(batch)                   # [1, D], as the policy's own
 
-For policies that draw a new sample at each call (pi0, SmolVLA, Diffusion, TD-MPC). ACT gives the same chunk
-each time, so that a forbidden one is replaced by the certified continuation at once (see `samples`). A policy
-with discrete actions needs none of this: give its logits to `session.step`.
+This is for policies that draw a new sample at each call (pi0, SmolVLA, Diffusion, TD-MPC). ACT returns the
+same chunk each time: if that is forbidden, the certified continuation replaces it at once (see `samples`). A
+policy with discrete actions does not need this: give its logits to `session.step`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from specshield.integrations.samples import Sampled
 
 
 class Policy(Protocol):
-    """What is used of lerobot's PreTrainedPolicy (0.4)."""
+    """The used methods of lerobot's PreTrainedPolicy (0.4)."""
 
     def predict_action_chunk(self, batch: dict[str, Any]) -> torch.Tensor: ...
     def select_action(self, batch: dict[str, Any]) -> torch.Tensor: ...
@@ -51,13 +51,13 @@ class ShieldedPolicy(Sampled):
         return torch.as_tensor(np.asarray(self._instead(chosen, rows[chosen.like]))[None]).to(chunks[0])
 
     def _observed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What `predict_action_chunk` is to be given. A policy that looks at several observations keeps them
-        in queues, which its own `select_action` fills; of a batch it then reads the names alone.
+        """The batch for `predict_action_chunk`. A policy that looks at several observations keeps them in
+        queues, which its own `select_action` fills; of the batch it then reads only the names.
         """
         queues: dict[str, Any] = getattr(self._policy, "_queues", None) or {}
         kept = [name for name in queues if name != "action"]
         if not kept:
             return observation
-        queues["action"].clear()  # else it would run an older chunk to its end, and draw no new one
+        queues["action"].clear()  # else it would finish an older chunk before it draws a new one
         self._policy.select_action(dict(observation))
         return dict.fromkeys(kept)

@@ -2,11 +2,11 @@
 
     env = shielded(gymnasium.make("BabyAI-GoToObjMazeOpen-v0"), "F[0,100] Room_0_0 and F[100,200] Room_2_2")
 
-A cell is 1 m. x is the column, y counts rows from the lowest, so that theta turns counter-clockwise as ours
-do; `Room_c_r` is the inside of the room in column c and row r of MiniGrid's own count, from the top left.
-The map is what the grid holds after `reset`: walls, things and closed doors are occupied. Actions that would
-change it (`toggle`, and `drop` with something in hand) are not possible: the robot that the shield knows
-moves and turns, and no more. What is picked up leaves a cell that stays occupied for the shield.
+A cell is 1 m. x is the column, and y counts rows from the lowest, so that theta turns counter-clockwise.
+`Room_c_r` is the inside of the room in column c and row r, which MiniGrid counts from the top left. The map
+is the grid after `reset`: walls, things and closed doors are occupied. Actions that would change it
+(`toggle`, and `drop` with something in hand) are not possible, since the shield's robot only moves and turns.
+After a thing is picked up, its cell stays occupied for the shield.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TURNS = {"left": math.pi / 2, "right": -math.pi / 2}  # [rad]
 MOVES = {"forward": 1.0}  # [m]
 ROBOT = Robot(
     "minigrid",
-    radius=0.3,  # [m] any below half a cell will do
+    radius=0.3,  # [m] any radius below half a cell
     offset=(0.0, 0.0),
     on_contact="stay",
     actions=tuple(Action(a.name, MOVES.get(a.name, 0.0), TURNS.get(a.name, 0.0)) for a in Actions),
@@ -43,7 +43,7 @@ def shielded(
 ) -> ShieldWrapper:
     """`env`, a MiniGrid environment, inside a rule over its rooms and `regions`. options: of ShieldWrapper.
 
-    Each `reset` makes a policy for the map that it finds, in some hundredths of a second.
+    Each `reset` makes a policy for its map, in some hundredths of a second.
     """
 
     def made(env: Environment) -> LocalShield:  # check=False: random starts lie off the cells' centres
@@ -61,7 +61,7 @@ def pose_of(env: Environment) -> Pose:
 
 
 def grid_of(env: Environment) -> OccupancyGrid:
-    """The cells that cannot be entered now."""
+    """The map, in which the cells that cannot be entered now are occupied."""
     inner: Any = env.unwrapped
     cells = [inner.grid.get(column, row) for row in range(inner.height) for column in range(inner.width)]
     occupied = np.array([cell is not None and not cell.can_overlap() for cell in cells])
@@ -84,7 +84,7 @@ def rooms_of(env: Environment) -> dict[str, Region]:
 
 
 def possible(env: Environment) -> Bools:
-    """[7]: the actions after which the map is as it was."""
+    """Booleans [7]: the actions that do not change the map."""
     inner: Any = env.unwrapped
     allowed = np.ones(len(Actions), bool)
     allowed[Actions.toggle] = inner.grid.get(*inner.front_pos) is None

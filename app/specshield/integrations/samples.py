@@ -1,13 +1,13 @@
-"""Policies that answer with samples of continuous actions, inside a rule.
+"""Keeps policies that draw samples of continuous actions inside a rule.
 
-A shield chooses among a robot's actions. A policy such as pi0 offers samples instead: so each sample is read
-as the action that is nearest to its motion, and how many samples each action has is the model's distribution.
-The sample that is run is one of those of the action that the shield drew, as it came from the model.
+A shield chooses among a robot's actions. A policy such as pi0 draws samples instead. So each sample counts as
+the action whose motion is nearest, and the shares of the samples are the model's distribution. The shield
+draws an action, and one of its samples is run as it came from the model.
 
-What this cannot do: a policy that gives the same sample each time has one action, and where that is forbidden
-the certified continuation is run instead; only the first row of a chunk is run and judged; between the
-sample and its nearest action there is a gap, which the session sees as a residual (`uncertainty="learned"`
-keeps a margin for it, and the guarantee is then no better than that).
+Limits: a policy that returns the same sample each time has only one action, and if that is forbidden, the
+certified continuation is run instead. Only the first row of a chunk is judged and run. A sample differs from
+its nearest action, which the session sees as a residual: `uncertainty="learned"` keeps a margin for it, and
+the guarantee is no better than that.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from specshield.robot import Robot
 
 
 class Session(Protocol):
-    """What a LocalSession and a session of the SDK have in common, as far as it is needed here."""
+    """The interface that is needed here of a LocalSession or a session of the SDK."""
 
     main_task_done: bool
 
@@ -33,8 +33,8 @@ class Session(Protocol):
 
 
 class Chosen(NamedTuple):
-    """sample: the index of the sample to run, None where none is allowed and the robot's `action` is run, in
-    all else like the sample `like`. action: None where the service is away and the robot has to stand.
+    """sample: the index of the sample to run. None: no sample is allowed, and `action` is run, with
+    everything else as in the sample `like`. action: None if the service is away and the robot has to stand.
     """
 
     action: int | None
@@ -47,8 +47,8 @@ class Chosen(NamedTuple):
 class SampleShield:
     """Chooses among samples.
 
-    robot: the one that the session's policy was made for. pose_of: (x, y, theta) in the map's frame, from an
-    observation. command_of: how far a sample's first row moves [m] and turns [rad] the robot in one step.
+    robot: the robot of the session's policy. pose_of: returns (x, y, theta) in the map's frame for an
+    observation. command_of: returns how far a sample's first row moves [m] and turns [rad] the robot.
     """
 
     session: Session
@@ -57,8 +57,8 @@ class SampleShield:
     command_of: Callable[[Floats], tuple[float, float]]
 
     def choose(self, rows: Sequence[Floats], observation: Any) -> Chosen:
-        """rows: the first row of each sample; those whose command is not finite are left out. One decision
-        of the session. Raises InputError where none is left.
+        """Makes one decision of the session. rows: the first row of each sample; rows whose command is not
+        finite are left out. Raises InputError if none is left.
         """
         commands = np.array([self.command_of(row) for row in rows], np.float64).reshape(len(rows), 2)
         usable = np.flatnonzero(np.isfinite(commands).all(axis=1))
@@ -78,8 +78,8 @@ class SampleShield:
 class Sampled:
     """`policy` inside the rule of a shield's session.
 
-    row_of: a row of actions [D] that makes the robot's motion of `translate` [m] and `rotate` [rad], like the
-    given row in all else: what is run where no sample is allowed. samples: how often the policy is asked.
+    row_of: returns a row of actions [D] that moves the robot by `translate` [m] and `rotate` [rad] and is
+    else like the given row; it is run if no sample is allowed. samples: how many are drawn for each decision.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class Sampled:
         self._policy, self._shield, self._row_of, self._samples = policy, shield, row_of, samples
 
     def reset(self) -> None:
-        """Of the policy; a session is for one episode, so a new one takes a new wrapper."""
+        """Resets the policy. A session is for one episode: a new episode needs a new wrapper."""
         self._policy.reset()
 
     def _instead(self, chosen: Chosen, row: Floats) -> Floats:
-        """The row that is run where no sample is allowed."""
+        """The row that is run if no sample is allowed."""
         if chosen.action is None:
             return self._row_of(0.0, 0.0, row)
         action = self._shield.robot.actions[chosen.action]

@@ -7,14 +7,14 @@
                           logits_processor=LogitsProcessorList([shaping]), pad_token_id=...)
     action = shaping.action(text)
 
-Each action is one token or several. The shield is asked once a generation, at its first token; from then on
-each token gets the probability that the shaped distribution leaves for the actions that begin with it, so the
-generated action is one draw from that distribution. Masking forbidden tokens one by one would not be: it
-renormalises at every token, and prefers actions whose first tokens are shared.
+Each action is one token or several. The shield decides once for each generation, at the first token. Then
+each token gets the probability that the shaped distribution has for the actions that go on with it, so the
+generated action is one draw from that distribution. Masking forbidden tokens one by one would be another
+distribution: it renormalises at every token, and prefers actions whose first tokens are shared.
 
 Draw at temperature 1, without top-k and top-p: Hugging Face applies those after this, and they would change
-the shaped distribution. A temperature of the model's own belongs in the logits that the shield is asked with
-(`temperature` here). One sequence at a time, no beams: a robot takes one action.
+the shaped distribution. The model's own temperature belongs into the shield's logits (`temperature` here).
+Generate one sequence at a time, without beams: a robot takes one action.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from specshield.errors import InputError, LogitsError
 
 
 class ShieldLogitsProcessor(LogitsProcessor):
-    """The distribution of a decision, as scores of tokens. For one generation, then made anew.
+    """The distribution of a decision as scores of tokens. Each generation needs a new object.
 
-    ask: gives the decision for logits [A]; session.step with the pose, usually. tokens: of each action, in
-    the order of the robot's actions. logits: the model's own, one an action, as `score_actions` has them;
-    None where every action is a single token, whose scores are taken. temperature: of the model's
-    distribution, above 0. eos: the token that ends an action whose tokens begin another's.
+    ask: returns the decision for logits [A], usually by session.step with the pose. tokens: of each action,
+    in the order of the robot's actions. logits: the model's, one for each action, by `score_actions`; None if
+    every action is a single token, whose scores are used. temperature: of the model's distribution, above 0.
+    eos: the token that ends an action whose tokens are the beginning of another action's.
 
-    Raises InputError for tokens or a temperature that cannot be used, LogitsError for too few or many logits.
+    Raises InputError for wrong tokens or a wrong temperature, LogitsError for a wrong number of logits.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class ShieldLogitsProcessor(LogitsProcessor):
 
     @property
     def longest(self) -> int:
-        """How many tokens an action takes at most."""
+        """The most tokens that an action has."""
         return max(map(len, self._tokens))
 
     def __call__(self, input_ids: torch.LongTensor, scores: torch.Tensor) -> torch.Tensor:
-        """scores [1, V] of the next token: those of the tokens that go on with an allowed action."""
+        """The scores [1, V] of the next token: minus infinity unless it goes on with an allowed action."""
         if len(scores) != 1:
             what, got = "one sequence at a time", list(input_ids.shape)
             raise InputError(what, path="input_ids", got=got, expected="shape [1, n]")
@@ -88,10 +88,10 @@ class ShieldLogitsProcessor(LogitsProcessor):
         return shaped
 
     def action(self, sequence: torch.Tensor) -> int | None:
-        """The action that was generated, an index. sequence [1, n]: prompt and answer, as generate gives.
+        """The index of the generated action. sequence [1, n]: prompt and answer, as `generate` returns them.
 
-        Where it is a terminal one, run `decision.completion_action` while the rule is pending. None where the
-        service is away and the robot has to stand.
+        If it is a terminal one, run `decision.completion_action` while the rule is pending. None: the service
+        is away and the robot has to stand.
         """
         if isinstance(self.decision, LocalDecision):
             return self.decision.execute
@@ -102,18 +102,18 @@ class ShieldLogitsProcessor(LogitsProcessor):
         return max(found, key=lambda i: len(self._tokens[i]))
 
     def _following(self, said: tuple[int, ...], distribution: Sequence[float]) -> dict[int, float]:
-        """The mass of each token that may come next; after a whole action, that of the end alone."""
+        """The probability of each token that may come next; after a complete action only that of its end."""
         masses: dict[int, float] = {}
         for tokens, mass in zip(self._tokens, distribution, strict=True):
             if mass > 0.0 and tokens[: len(said)] == said:
                 token = tokens[len(said)] if len(tokens) > len(said) else self._eos
                 if token is not None:
                     masses[token] = masses.get(token, 0.0) + mass
-        return masses or {0 if self._eos is None else self._eos: 1.0}  # what follows an action is not read
+        return masses or {0 if self._eos is None else self._eos: 1.0}  # nobody reads what follows an action
 
 
-def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None = None) -> list[tuple[int, ...]]:
-    """The tokens of each action. Raises InputError where two actions cannot be told apart."""
+def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None) -> list[tuple[int, ...]]:
+    """The tokens of each action. Raises InputError if two actions cannot be told apart."""
     read = [tuple(int(token) for token in sequence) for sequence in tokens]
     for i, one in enumerate(read):
         if not one or one in read[:i]:
@@ -129,9 +129,8 @@ def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None = None) -> lis
 def score_actions(
     model: Any, prompt: torch.Tensor, tokens: Sequence[Sequence[int]], eos: int | None = None
 ) -> Floats:
-    """Log-probabilities [A] of each action after a prompt [1, n], in one pass of a causal model.
-
-    With `eos`, those of the action and of its end.
+    """The log-probabilities [A] of all actions after a prompt [1, n], in one pass of a causal model; with
+    `eos` each action includes its end.
     """
     read = check_tokens(tokens, eos)
     ended = [sequence if eos is None else (*sequence, eos) for sequence in read]

@@ -1,1 +1,1 @@
-"""Sessions as files that other tools open, and drives of others judged by a rule."""
+"""Writes sessions as files for other tools, and judges recorded drives by a rule."""

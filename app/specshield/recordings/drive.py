@@ -1,4 +1,4 @@
-"""Somebody's drive from a rosbag2, judged by a rule: would it have been kept, and from where not any more."""
+"""Judges a drive in a rosbag2 by a rule: whether it was kept, and from which step on it could not be kept."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from specshield.client.models import Pose, Verdict
 from specshield.errors import InputError
 from specshield.local import LocalShield
 
-POSES = {  # message types that hold a pose in one frame, and where in them
+POSES = {  # the types of messages with a pose in one frame, and how to get the pose
     "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
@@ -23,8 +23,8 @@ MOST_STEPS = 1_000_000  # of a drive; chosen by hand, some hundred times what a 
 
 
 class Judged(NamedTuple):
-    """lost: the first step from which no future was found that keeps the rule, None where there always was
-    one. last: the pose before it. left: the steps that the drive lacks to the horizon.
+    """lost: the first step from which no future was found that keeps the rule, None if there always was one.
+    last: the pose before it. left: the number of steps that the drive lacks to the horizon.
     """
 
     verdict: Verdict
@@ -35,10 +35,10 @@ class Judged(NamedTuple):
 
 
 def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floats:
-    """Poses [n, 3], one every `step_seconds` from the first on, each the newest there is by then.
+    """The poses [n, 3] of a drive: from the first on, the newest one after each `step_seconds`.
 
-    bag: a folder of rosbag2 (or a rosbag1 file). topic: one with poses in the map's frame; None: the only
-    one there is. Raises InputError.
+    bag: a folder of rosbag2, or a rosbag1 file. topic: of poses in the map's frame; None: the only one.
+    Raises InputError.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -58,18 +58,18 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
                     got=topic,
                     expected=f"one of {', '.join(topics)}" if topics else f"a bag with {' or '.join(POSES)}",
                 )
-            meant = [c for c in known if c.topic == topic]  # each node that sends poses there has its own
+            meant = [c for c in known if c.topic == topic]  # several nodes may send poses there
             found = [
                 (at, _planar(POSES[c.msgtype](reader.deserialize(raw, c.msgtype))))
                 for c, at, raw in reader.messages(connections=meant)
             ]
     except InputError:
         raise
-    except Exception as error:  # rosbags lets through whatever its parsers raise of a damaged file
+    except Exception as error:  # the parsers of rosbags may raise anything for a damaged file
         raise InputError(f"the bag cannot be read: {error}", path="BAG", got=str(bag)) from None
     if not found:
         raise InputError("no poses on this topic", path="--topic", got=topic, expected="at least one")
-    # From the first on: a float of the seconds since 1970 is too coarse to find the pose of a step by.
+    # Times count from the first pose: as seconds since 1970 they would be too coarse in a float.
     times = 1e-9 * np.array([at - found[0][0] for at, _ in found])
     if times[-1] > MOST_STEPS * step_seconds:
         told = "the poses are too far apart in time; was a clock set while they were recorded?"
@@ -82,7 +82,7 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
 
 
 def check_drive(shield: LocalShield, poses: Floats) -> Judged:
-    """poses [n, 3]: x_0 .. x_{n-1} in the map's frame, a step apart; those past the horizon are left out."""
+    """Judges poses [n, 3]: x_0 .. x_{n-1} in the map's frame, a step apart, up to the horizon."""
     horizon = shield.task.horizon
     poses = poses[: horizon + 1]
     actions, lost = len(shield.task.robot.actions), None
@@ -106,7 +106,7 @@ def check_drive(shield: LocalShield, poses: Floats) -> Judged:
 
 
 def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[str]:
-    """What came of it, in lines for people."""
+    """The result in lines for people."""
     yield f"rule: {shield.task.formula}"
     yield f"drive: {judged.steps} steps of {step_seconds:g} s"
     if signals := shield.task.signals:

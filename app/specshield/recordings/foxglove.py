@@ -1,8 +1,8 @@
-"""A session as MCAP, with the schemas that Foxglove draws: map, pose and scene, and each decision as JSON.
+"""Writes a session as MCAP with Foxglove's schemas: map, pose and scene, and each decision as JSON.
 
 Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/scene` (foxglove.SceneUpdate: regions, the
-way that was driven, the certified continuation), `/decision` (specshield.Decision, the answer as it was
-given). Everything is in the frame `map`.
+way driven, the certified continuation), `/decision` (specshield.Decision: the service's answer). All are in
+the frame `map`.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:
 
 
 def _grid(grid: OccupancyGrid, now: fox.Timestamp) -> fox.Grid:
-    """One byte a cell: 1 is occupied."""
+    """The map, with one byte for each cell: 1 is occupied."""
     field = fox.PackedElementField(name="occupied", offset=0, type=fox.PackedElementFieldNumericType.Uint8)
     return fox.Grid(
         timestamp=now,

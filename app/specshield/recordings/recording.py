@@ -1,4 +1,4 @@
-"""A session as it is written to files: where the robot was, what it was told, and what it moved on."""
+"""A session in the form from which files are written: the robot's poses, the decisions, and the map."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recording:
-    """items: one a step, x_0 first. grid, robot: None where they are not at hand; ways ahead are then not
-    drawn. begun: the time of x_0 [s since 1970]. step_seconds: how long a step took [s].
+    """items: one for each step, x_0 first. grid, robot: None if they are not available; ways ahead are not
+    drawn then. begun: the time of x_0 [s since 1970]. step_seconds: the duration of a step [s].
     """
 
     id: str
@@ -43,11 +43,11 @@ class Recording:
     step_seconds: float = 1.0
 
     def seconds(self, t: int) -> float:
-        """When step t was [s since 1970]."""
+        """The time of step t [s since 1970]."""
         return self.begun + t * self.step_seconds
 
     def ahead(self, t: int) -> Floats:
-        """The certified continuation at step t, as poses [n, 3] from x_t on; only x_t where there is none."""
+        """The certified continuation at step t, as poses [n, 3] from x_t on; only x_t if there is none."""
         pose, told = self.items[t].pose, self.items[t].decision
         if told is None or self.grid is None or self.robot is None:
             return np.array([pose])
@@ -56,18 +56,18 @@ class Recording:
 
 
 def of_record(
-    chain: Chain, grid: OccupancyGrid | None, rooms: Mapping[str, Region], step_seconds: float = 1.0
+    chain: Chain, grid: OccupancyGrid | None, rooms: Mapping[str, Region], step_seconds: float
 ) -> Recording:
-    """Of a session's record, which a server gives (`GET /v1/sessions/{id}/record`).
+    """The recording that a session's record holds (`GET /v1/sessions/{id}/record`).
 
-    grid, rooms: of its map, None and {} where that is not at hand. Raises InputError for one with a switch.
+    grid, rooms: of its map, None and {} if that is not available. Raises InputError after a switch.
     """
     from specshield.service.schemas.answers import to_json
     from specshield.service.sessions import record
 
     if len(chain.configs) > 1:
         raise InputError(
-            "the session had several rules, and one is written to a file",
+            "the session had several rules, and a file can have only one",
             got=len(chain.configs),
             expected="a session without a switch",
         )
@@ -94,7 +94,7 @@ def of_record(
 
 
 def map_of_service(client: ShieldClient, map_id: str) -> tuple[OccupancyGrid, Mapping[str, Region]]:
-    """A server's map, from what it shows of it: in the picture black is occupied, row 0 the highest y."""
+    """A server's map, read from its description and its picture: black is occupied, row 0 the highest y."""
     about = client.maps.get(map_id)
     pixels = np.asarray(Image.open(io.BytesIO(client.maps.image(map_id))).convert("L"))
     return OccupancyGrid(pixels[::-1] < 128, about.resolution, about.origin), parse_regions(dict(about.rooms))

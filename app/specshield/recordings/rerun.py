@@ -1,4 +1,4 @@
-"""A session for Rerun's viewer."""
+"""Writes a session for Rerun's viewer."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from specshield.recordings.recording import Recording
 
 
 def write_rrd(recording: Recording, path: Path) -> None:
-    """Timelines `step` and `time`; `world` in metres, and scalars below `decision`."""
+    """Writes the timelines `step` and `time`, `world` in metres, and scalars below `decision`."""
     stream = rerun.RecordingStream("specshield", recording_id=recording.id)
-    path.open("ab").close()  # OSError where it cannot be written, of which rerun makes a RuntimeError
+    path.open("ab").close()  # raises OSError for a wrong path, which rerun would turn into a RuntimeError
     stream.save(path)
     if recording.grid is not None:
         rows, columns = np.nonzero(recording.grid.occupied)

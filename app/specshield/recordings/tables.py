@@ -1,4 +1,4 @@
-"""A session as a table, one row a step: CSV, and Parquet by pyarrow."""
+"""Writes a session as a table with one row for each step: as CSV, and by pyarrow as Parquet."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ TOLD = (
 
 
 def rows(recording: Recording) -> list[dict[str, Any]]:
-    """The step, when it was, pose and signals, what was told of it, and pi* and rho of each action.
+    """The rows: step, time, pose and signals, the members of the answer, and pi* and rho of each action.
 
-    What was told is None where a pose was sent without a decision.
+    All that belongs to the answer is None for a step without a decision.
     """
     found = []
     for item in recording.items:
@@ -44,7 +44,7 @@ def write_csv(recording: Recording, path: Path) -> None:
 
 
 def write_parquet(recording: Recording, path: Path) -> None:
-    """The rule and the actions are in the file's metadata."""
+    """Writes the table, with the rule and the actions in the file's metadata."""
     import pyarrow as arrow
     from pyarrow import parquet
 
