@@ -100,6 +100,19 @@ def test_a_house_or_a_grid_may_be_yaml(content, ending, tmp_path):
     assert "Connection refused" in refused.stderr  # by then the file was read
 
 
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("flat.v2", "Connection refused"),  # a name on the server may have a dot
+        ("flat.yaml", "--map: flat.yaml cannot be read: No such file or directory"),
+        ("maps/flat", "--map: maps/flat cannot be read: No such file or directory"),
+    ],
+)
+def test_what_is_no_file_is_a_map_of_the_server_unless_it_is_written_as_a_file(asked, said, tmp_path):
+    named = ("--map", asked, "--rule", "F[0,9] x > 1", "--out", tmp_path)
+    assert said in run_specshield("policy", *named, "--url", "http://127.0.0.1:9").stderr
+
+
 def test_sizes_of_furniture_for_what_is_no_house_are_refused(tmp_path):
     refused = run_specshield(
         "policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--assets", tmp_path / "sizes.json",

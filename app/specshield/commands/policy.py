@@ -81,7 +81,8 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     map of this id or name.
     """
     path = Path(map)
-    content = _read(path, "--map") if path.suffix or path.is_file() else None
+    named = "/" not in map and path.suffix.lower() not in (".json", ".yaml", ".yml") and not path.is_file()
+    content = None if named else _read(path, "--map")
     if assets is not None and "rooms" not in (content or {}):
         raise InputError("only a ProcTHOR house has furniture", path="--assets", expected="no --assets")
     if content is None:
