@@ -34,6 +34,7 @@ from specshield.sim.service import follow_parent, own_server
 from tests.serving import free_port
 
 CASE, HEADING = "case1", 0.0
+PING, PONG = 0x89, 0x8A  # frames that a server sends every 20 s, and wants back (RFC 6455, 5.5)
 Ask = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
@@ -88,7 +89,9 @@ class Connection:
         )
         frame = b"\x82" + size + bytes(4) + content
         self._writer.write(frame)
-        head = await self._reader.readexactly(2)
+        while (head := await self._reader.readexactly(2))[0] == PING:
+            asked = await self._reader.readexactly(head[1])
+            self._writer.write(bytes([PONG, 0x80 + head[1]]) + bytes(4) + asked)
         short = head[1] < 126
         length = head[1] if short else int.from_bytes(await self._reader.readexactly(2), "big")
         answer = await self._reader.readexactly(length)
