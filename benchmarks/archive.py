@@ -25,7 +25,7 @@ from benchmarks.states import along
 from evaluation.shipped import shipped
 from specshield.service.sessions import record
 from specshield.service.sessions.mover import Mover
-from specshield.service.sessions.state import State, own
+from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import FENCE, RETURN, ArchivingStore
@@ -58,7 +58,7 @@ def episodes(count: int, seed: int) -> list[Dump]:
         steps += [b""] * (state.t - len(steps)) + [record.encode(made)]
         ended = State(
             len(state.history), state.t + 1, True, decision.spec_status, time.time() + TTL,
-            record.digest(steps[-1]), main_task_done=done, finished=True, carry=own(decision.carry),
+            record.digest(steps[-1]), main_task_done=done, finished=True, carry=decision.carry,
         )  # fmt: skip
         config = json.dumps({"spec": case.spec, "actions": list(case.task.robot.action_names)}).encode()
         dump = Dump(config, ended.packed(), b"", state.history.astype("<f8").tobytes(), list(steps))

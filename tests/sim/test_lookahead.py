@@ -10,7 +10,7 @@ from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.portable import exp
-from specshield.service.sessions.state import State, own
+from specshield.service.sessions.state import State
 from specshield.shield.decision import Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
@@ -36,7 +36,7 @@ def stored(carry):
 
 
 def loaded(carry):
-    return own(State.of(stored(carry)).carry)
+    return State.of(stored(carry)).carry
 
 
 def episode(case, shield, seed, each=lambda decision, logits: None):

@@ -24,7 +24,6 @@ from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import carried_over, way
 from specshield.service.sessions.session import decide
-from specshield.service.sessions.state import own
 from specshield.service.settings import Settings
 from specshield.shield.decision import Carry, Shield, make_shield
 from specshield.shield.taught import Taught
@@ -136,7 +135,7 @@ def _again(
     if not history.agree(np.array(asked.pose), rows[-1, :3]).all():
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
     decision, made = decide(shield, asked, t, rows, names, carry, kept.before, kept.tables)
-    return made, own(decision.carry)
+    return made, decision.carry
 
 
 def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[str]]]:

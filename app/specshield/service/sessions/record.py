@@ -166,8 +166,7 @@ def make(
     pose, logits, main_task_done, signals, all_witnesses, occupied, free, explain = asked
     sent = struct.pack("<3d", *pose)
     actions = np.empty((len(decision.distribution), COLUMNS))
-    for column, values in enumerate((decision.j_values, decision.robustness)):
-        actions[:, column] = [math.nan if value is None else value for value in values]
+    actions[:, 0], actions[:, 1] = decision.j_values, decision.robustness  # None becomes NaN
     actions[:, 2:] = decision.next_poses
     rows, table, pool = pack_table(actions, row)
     return StepRecord(

@@ -42,7 +42,7 @@ from specshield.service.sessions.session import (
     there,
 )
 from specshield.service.sessions.shields import Shields
-from specshield.service.sessions.state import State, own
+from specshield.service.sessions.state import State
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
@@ -262,7 +262,6 @@ def begin(
         "version": __version__,
         "way": (way or b"").hex(),
     }
-    carry = handover.begun(rules.way(config))
     state = State(
         length=1,
         next_t=0,
@@ -270,7 +269,7 @@ def begin(
         spec_status=status,
         expires_at=0.0,
         head=record.digest(files.to_json(config)),
-        carry=own(carry),
+        carry=handover.begun(rules.way(config)),
         any_signal=any_signal(shield, rows[:, :3]),
     )
     return config, state, rows

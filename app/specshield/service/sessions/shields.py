@@ -62,7 +62,8 @@ class Shields:
         def make() -> Shield:
             return make_shield([self.policies.policy(self.policies.record(id)) for id in policy_ids])
 
-        return replace(self._shields.get(tuple(policy_ids), make), config=config)
+        known = self._shields.get(tuple(policy_ids), make)
+        return Shield(known.task, known.proposers, config, known.body, known.view)  # `replace` takes longer
 
     def of(self, session: Session) -> Shield:
         """The session's shield, with its preference if that is prepared."""

@@ -11,7 +11,7 @@ import numpy as np
 from specshield.errors import StoreError
 from specshield.shield.decision import Carry
 from specshield.shield.taught import HEAD, Taught
-from specshield.world.learned import LearnedMap
+from specshield.world.learned import NONE, LearnedMap
 
 
 class State(msgspec.Struct, frozen=True, array_like=True):
@@ -19,8 +19,8 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     length: the number of stored poses. next_t: the step after the last decided one. expires_at [s since
     1970]. head: SHA-256 of the last step's record, or of the config if that has no decided step yet. carry:
-    the memory of the last decision, to be copied by `own` before it is used. verdicts: of the rules before
-    the one in force. any_signal: as in `Decision`, at the first step of the rule in force.
+    the memory of the last decision; stored field by field, its poses as float64 bytes. verdicts: of the rules
+    before the one in force. any_signal: as in `Decision`, at the first step of the rule in force.
     """
 
     length: int
@@ -46,23 +46,21 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def has_learned(self) -> bool:
-        """Whether the session's own map has ever changed."""
-        return self.carry is not None and len(self.carry.learned or b"") > HEAD.size
+        """Whether the session's own map has ever changed, or `learned` raises; without unpacking it."""
+        known = None if self.carry is None else self.carry.learned
+        return known is not None and len(known) != HEAD.size
 
     @property
     def learned(self) -> LearnedMap:
         """The learned map after the last decision. Raises StoreError where another version stored it."""
         try:
-            return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
+            return Taught.from_bytes(self.carry.learned).map if self.carry and self.has_learned else NONE
         except (struct.error, zlib.error, ValueError) as error:
             told = "another version of specshield decided the session's last step: no further one is decided"
             raise StoreError(told, expected="a server of that version, or a new session") from error
 
 
-def own(carry: Carry | None) -> Carry | None:
-    """A copy whose poses are an array of its own and writable, as the kernels were compiled for."""
-    return None if carry is None else carry._replace(next_poses=carry.next_poses.copy())
-
-
 _encoder = msgspec.msgpack.Encoder(enc_hook=lambda poses: poses.astype("<f8", copy=False).tobytes())
-_decoder = msgspec.msgpack.Decoder(State, dec_hook=lambda _, raw: np.frombuffer(raw, "<f8").reshape(-1, 3))
+_decoder = msgspec.msgpack.Decoder(  # of poses that are writable: kernels were compiled for that
+    State, dec_hook=lambda _, raw: np.frombuffer(raw, "<f8").reshape(-1, 3).copy()
+)

@@ -24,7 +24,7 @@ from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import RACES, Session, asked_of, contended, decide, missing
 from specshield.service.sessions.shields import Shields
-from specshield.service.sessions.state import State, own
+from specshield.service.sessions.state import State
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
 from specshield.task import check_signals
@@ -166,7 +166,7 @@ class Steps:
             head=record.digest(content),
             main_task_done=request.main_task_done,
             finished=decision.finished,
-            carry=own(decision.carry),
+            carry=decision.carry,
         )
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
@@ -209,7 +209,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    carry = own(state.carry)
     shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
-    before = record.link(state.head, session.rows[state.next_t :])
-    return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))
+    before, since = record.link(state.head, session.rows[state.next_t :]), session.since
+    return Decided(session, *decide(shield, asked, request.t, since, names, state.carry, before, tables))

@@ -21,7 +21,6 @@ from specshield.service.sessions import history, record, rules
 from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.session import RACES, Session, check_last, contended, describe, pack, there
 from specshield.service.sessions.shields import Run, Shields
-from specshield.service.sessions.state import own
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
@@ -178,7 +177,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         rows=rules.widened(session.rows, session.signal_names, signals),
         signal_names=names,
     )
-    carry, _ = own(session.state.carry), session.state.learned  # raises StoreError for what cannot be read
+    carry, _ = session.state.carry, session.state.learned  # raises StoreError for what cannot be read
     known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
@@ -194,7 +193,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         feasible=True,
         spec_status=status,
         head=record.digest(files.to_json(config)),
-        carry=own(known._replace(way=way)),
+        carry=known._replace(way=way),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], rules.signals_in(seen, names)),
     )
