@@ -1,4 +1,4 @@
-"""A policy's card: the JSON beside its weights that says what the policy is for and how it was made."""
+"""What policies share, and the card of one: the JSON that says what it is for and how it was made."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from specshield.robot import robot_to_json
 from specshield.robot.dynamics import Body, make_body
+from specshield.shield.proposal import Proposal
 from specshield.task import Task
 from specshield.world.regions import region_to_json
 
@@ -32,6 +35,13 @@ class Carded:
     @cached_property
     def _body(self) -> Body:
         return make_body(self.task.robot, self.task.grid)
+
+
+def joined(*proposals: Proposal) -> Proposal:
+    """The futures of all of them; what the first prefers is preferred."""
+    if len(proposals) == 1:
+        return proposals[0]
+    return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)
 
 
 def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:

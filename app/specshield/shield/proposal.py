@@ -50,11 +50,6 @@ class Proposer(Protocol):
         ...
 
 
-def joined(*proposals: Proposal) -> Proposal:
-    """The futures of all proposals as one proposal, which prefers what the first one prefers."""
-    return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)
-
-
 def adapted(proposer: Proposer, how: str, *told: object) -> Proposer:
     """The copy of a proposer that its method `how` returns, such as `on_body` (CONTRIBUTING.md lists them).
 

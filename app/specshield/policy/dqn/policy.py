@@ -12,7 +12,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Floats, Ints
 from specshield.errors import PolicyError
-from specshield.policy.card import Card, Carded
+from specshield.policy.card import Card, Carded, joined
 from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import observation_size
@@ -24,7 +24,7 @@ from specshield.policy.tensors import read_tensors
 from specshield.policy.undo import undoing_motions
 from specshield.robot.dynamics import Body, make_body, motion_count
 from specshield.rule.values import signal_rows
-from specshield.shield.proposal import Proposal, joined
+from specshield.shield.proposal import Proposal
 from specshield.task import Task
 
 

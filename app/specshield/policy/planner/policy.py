@@ -23,7 +23,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
-from specshield.policy.card import Card, Carded, make_card
+from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
 from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
 from specshield.policy.methods import Run
@@ -47,7 +47,7 @@ from specshield.rule.residual import all_of
 from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
-from specshield.shield.proposal import Proposal, joined
+from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicates
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree

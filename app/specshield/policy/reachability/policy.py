@@ -15,7 +15,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats
 from specshield.errors import MapError, PolicyError, SampleError
-from specshield.policy.card import Card, Carded, make_card
+from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
@@ -42,7 +42,7 @@ from specshield.robot.room import widened
 from specshield.rule.values import signal_rows
 from specshield.rule.view import view_of
 from specshield.shield.feasibility import prefix_of, simulated
-from specshield.shield.proposal import Proposal, joined
+from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
@@ -165,7 +165,7 @@ class ReachabilityPolicy(Carded):
                 if not sooner:
                     continue
             motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
-            wanted = np.full(shape[0], not self.brief) if self.wanted is None else self.wanted.copy()
+            wanted = np.array([not self.brief] * shape[0] if self.wanted is None else self.wanted)
             around = NO_WAY
             if self.guess:
                 fields = self._fields if guide.wait < 0 else NO_FIELDS
