@@ -38,7 +38,7 @@ class Carded:
 
 
 def joined(*proposals: Proposal) -> Proposal:
-    """The futures of all of them; what the first prefers is preferred."""
+    """The futures of all proposals as one proposal, which prefers what the first one prefers."""
     if len(proposals) == 1:
         return proposals[0]
     return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)

@@ -39,8 +39,7 @@ def answer_of(
     """
     terminal, any_feasible = shield.task.robot.terminal, judged.some
     said: Reason | None = "margin_unattainable" if judged.aimed.lowered else None
-    certified = np.zeros(len(terminal))
-    certified[judged.completion] = 1.0
+    certified = all_on(judged.completion, len(terminal))
     conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
     if main_task_done or log_prior is None:
         mode: Mode = "completion" if any_feasible else "fallback"
@@ -73,6 +72,12 @@ def unmodified(shield: Shield, log_prior: Floats | None) -> Answer:
     """The prior. Without logits nothing is left to do: `end`, or the first action if there is no `end`."""
     if log_prior is not None:
         return Answer(exp(log_prior), "prior", None)
-    idle = np.zeros(len(shield.task.robot.actions))
-    idle[int(np.argmax(shield.task.robot.terminal))] = 1.0
-    return Answer(idle, "prior", None)
+    terminal = shield.task.robot.terminal
+    return Answer(all_on(int(np.argmax(terminal)), len(terminal)), "prior", None)
+
+
+def all_on(action: int, count: int) -> Floats:
+    """The distribution [count] that has all its mass on one action."""
+    distribution = np.zeros(count)
+    distribution[action] = 1.0
+    return distribution

@@ -21,7 +21,7 @@ from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
 from specshield.robot.dynamics import Body, in_collision, simulate, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
-from specshield.shield.answer import answer_of, unmodified
+from specshield.shield.answer import all_on, answer_of, unmodified
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.caution.threshold import chances, left_of, next_left
 from specshield.shield.decision import Carry, Config, Decision, Explanation, Shield, make_shield
@@ -197,14 +197,14 @@ def decide(
     remembered = None
     if seen is not None:
         follows = shield.config.learn_map and taught.followed.surely
-        done = 1.0 * (np.arange(len(robot.actions)) == action) if follows else answer.distribution
+        done = all_on(action, len(robot.actions)) if follows else answer.distribution
         remembered = remember(shield, seen, done, moved, nexts, poses[-1])
     return Decision(
         t=t,
         mode=answer.mode,
         distribution=answer.distribution,
-        j_values=unknown if judged is None else as_numbers(j_values_of(shield, judged)),
-        robustness=unknown if judged is None else as_numbers(judged.robustness),
+        j_values=unknown if judged is None else j_values_of(shield, judged),
+        robustness=unknown if judged is None else as_numbers(judged.robustness.tolist()),
         action=action,
         action_name=robot.actions[action].name,
         completion_action=None if judged is None else judged.completion,
@@ -213,7 +213,7 @@ def decide(
         kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
         reason=answer.reason,
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
-        next_poses=places[robot.motion_of],
+        next_poses=places.take(robot.motion_of, 0),
         residual=residual,
         in_collision=touches,
         witness=as_actions(shield, certified, moved),
@@ -285,7 +285,8 @@ def _follow(
     alone = len(poses) - 2 - carry.t  # steps without a decision
     gap = np.empty(len(carry.next_poses))
     off = _gaps(carry.next_poses, poses[carry.t + 1], gap)
-    ways = [w for w, far in zip(carry.witnesses, gap, strict=True) if w and far <= sum(off) + SAME_POSE]
+    reach, gaps = sum(off) + SAME_POSE, gap.tolist()
+    ways = [w for w, far in zip(carry.witnesses, gaps, strict=True) if w and far <= reach]
     if alone > 0 and len(ways) > 1:  # a blocked move leads where waiting does
         ends = np.empty((len(ways), alone, 3))
         for w, end in zip(ways, ends, strict=True):

@@ -116,7 +116,7 @@ def futures(
     tail: T - t motions from x_t to the horizon, one a byte; they are simulated anew from the robot's pose.
     margins: each proposer is asked for futures with each of them.
     """
-    count, rows, warnings = len(prefix.task.robot.motions), list[Ints](), list[str]()
+    count, rows, warnings = len(prefix.task.robot.motions), [], []
     if tail is not None and len(tail) == prefix.steps:
         rows.append(np.frombuffer(tail, np.uint8).astype(np.int64)[None])
     preferred = None

@@ -292,10 +292,9 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     """Each motion's certified continuation, one motion a byte; None for a motion that is not feasible."""
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
-    motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
-    rows = motions[judged.aimed.best.row, 1:].astype(np.uint8)
-    content, n = rows.tobytes(), rows.shape[1]
-    return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
+    rows = judged.tried.motions.astype(np.uint8).take(judged.aimed.best.row, 0)
+    content, n, feasible = rows.tobytes(), rows.shape[1], judged.feasible_motion.tolist()
+    return tuple([content[m * n + 1 : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
@@ -305,14 +304,13 @@ def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int)
     return None if found is None else tuple(found.translate(shield.task.robot.action_table))
 
 
-def j_values_of(shield: Shield, judged: Judged) -> Floats:
+def j_values_of(shield: Shield, judged: Judged) -> tuple[float | None, ...]:
     """J of each action [A]; a terminal one has the highest of the others (docs/architecture.md)."""
-    values, terminal = judged.values, shield.task.robot.terminal
-    if shield.config.evaluation == "feasibility":
-        values = judged.feasible.astype(np.float64)
-    return np.where(terminal, values.max(), values)
+    binary, terminal = shield.config.evaluation == "feasibility", shield.task.robot.terminal.tolist()
+    values = [float(value) for value in (judged.feasible if binary else judged.values).tolist()]
+    return as_numbers([max(values) if ends else value for ends, value in zip(terminal, values, strict=True)])
 
 
-def as_numbers(values: Floats) -> tuple[float | None, ...]:
-    """The values as numbers; None in place of -inf, where nothing was evaluated."""
-    return tuple([None if value == -math.inf else value for value in values.tolist()])
+def as_numbers(values: list[float]) -> tuple[float | None, ...]:
+    """The values with None in place of -inf, where nothing was evaluated."""
+    return tuple([None if value == -math.inf else value for value in values])

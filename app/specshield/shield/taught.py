@@ -89,8 +89,7 @@ class Taught(NamedTuple):
 
     def to_bytes(self) -> bytes:
         known = self.followed
-        head = HEAD.pack(*known._replace(met=min(known.met, MOST_MET)))
-        return head + self.map.to_bytes()
+        return HEAD.pack(*known[:3], min(known.met, MOST_MET), *known[4:]) + self.map.to_bytes()
 
     @staticmethod
     def from_bytes(value: bytes | None) -> Taught:
@@ -194,7 +193,7 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
         room = not shield.task.robot.goes_back
         turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # for half a turn, twice
         least = max(least, AROUND + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if turn else 0))
-    return care._replace(least=least, barred=barred, on_way=on_way and unsure, room=room)
+    return Care(care.margin, least, *care[2:5], barred, on_way and unsure, room)
 
 
 def doubtful(
@@ -218,10 +217,10 @@ def doubtful(
     stopped = np.zeros(motions, np.bool_)
     if config.learn_map and (config.uncertainty is not None or len(known)):
         _stop_short(*displacements(told.body), pose, nexts, stopped)
-        for motion in np.flatnonzero(stopped).tolist():
+        for motion in [m for m, short in enumerate(stopped.tolist()) if short]:
             places = _farther(told.body, pose, motion, nexts[motion])
             risky[motion] = any(not prefix.allows(place) for place in places)
-        doubts |= risky
+            doubts[motion] |= risky[motion]
     if len(barred := taught.barred):
         doubts |= [is_barred(barred, pose[0], pose[1], pose[2], motion) for motion in range(motions)]
     return doubts, risky
@@ -270,7 +269,7 @@ def handed_on(
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
-    followed = taught.followed._replace(drawn=drawn)
+    followed = Followed(drawn, *taught.followed[1:])
     if followed.follows and followed.by_chance >= SELDOM:
         chance = partial(chance_of, shield.task.robot.motion_of, distribution, moved, nexts)
         going, standing = chance(nexts[drawn] if drawn >= 0 else pose), chance(pose)

@@ -64,8 +64,8 @@ def aim(
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     size, count = len(parts.kind), len(shield.task.robot.motions)
-    (still, short), settled = np.empty((2, size), np.bool_), np.empty(size)
-    asked, due = np.empty((2, size), np.int64)
+    still, short, settled = np.empty(size, np.bool_), np.empty(size, np.bool_), np.empty(size)
+    asked, due = np.empty(size, np.int64), np.empty(size, np.int64)
     arrays = still, settled, asked, due, prefix.t, short, leaves, whole, tried.motions
     now = Open(parts, *arrays, count, follows)
     if before is not None:
@@ -73,8 +73,8 @@ def aim(
         margin = min(care.margin, before.margin) + SATISFIED_ABOVE
         best, _ = _best_open(now, before.early, margin)
         return before._replace(best=best, kept=best.robustness > margin)
-    any_visit = np.full(size, SATISFIED_ABOVE)
-    aimed = _aim(shield, care, prefix, now, any_visit, np.zeros_like(asked))
+    any_visit = np.array([SATISFIED_ABOVE] * size)  # numpy is slow for so few
+    aimed = _aim(shield, care, prefix, now, any_visit, np.zeros(size, np.int64))
     if True not in short.tolist():
         return aimed
     # Places that were visited with less than the margin are visited again, all of them or else each of which
@@ -109,7 +109,7 @@ def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, 
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
     margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
-    less = (early < np.minimum(now.asked, shield.config.slack)).any()
+    less = shield.config.slack > 0 and (early < np.minimum(now.asked, shield.config.slack)).any()
     lowered = bool(less or margin_had < shield.config.margin)
     return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early, visits)
 

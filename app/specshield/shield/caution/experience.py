@@ -133,8 +133,8 @@ def remember(
     """`seen` as bytes for the next decision. distribution [A]: what the robot will do, as far as that is
     known; moved: the action that it executes for a terminal one; nexts [M, 3]: where f leads from the pose.
     """
-    motion_of = shield.task.robot.motion_of
-    return FORMAT.pack(*seen._replace(standing=chance_of(motion_of, distribution, moved, nexts, pose)))
+    standing = chance_of(shield.task.robot.motion_of, distribution, moved, nexts, pose)
+    return FORMAT.pack(*seen[:7], standing, seen.slipping)
 
 
 @kernel
