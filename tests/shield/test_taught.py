@@ -292,23 +292,28 @@ def test_a_motion_that_leads_nowhere_is_not_tried_for_ever(over, noise):
     assert int(STRETCH.motion_of[left]) in [motion for *_, motion in carry.stuck]
 
 
-def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_has_gone():
-    """A wall with one gap, and someone in it for 35 steps: nothing else leads to what is behind the wall.
+@pytest.mark.parametrize(
+    ("formula", "stays"), [("F[0,64] Goal", 35), ("F[0,64] Goal and F[64,110] Home", 40)]
+)
+def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_has_gone(formula, stays):
+    """A wall with one gap, and someone in it: nothing else leads to what is behind the wall.
 
-    From where the goal is nearest, at the wall, there would be too little time left.
+    From where the goal is nearest, at the wall, there would be too little time left; and from where the way
+    to Home leads, which can be driven at any time.
     """
     walls = np.zeros((40, 80), bool)
     walls[19:21, :56] = True
     someone = [(x, 1.0) for x in np.arange(2.825, 4.0, 0.05)]
-    goal, pose = {"Goal": {"type": "circle", "center": [0.6, 0.45], "radius": 0.35}}, (2.0, 1.5, 0.0)
-    task = make_task(OccupancyGrid(walls, 0.05), STRETCH, "F[0,64] Goal", goal)
+    places, pose = {"Goal": [0.6, 0.45], "Home": [0.6, 1.55]}, (2.0, 1.5, 0.0)
+    regions = {name: {"type": "circle", "center": at, "radius": 0.35} for name, at in places.items()}
+    task = make_task(OccupancyGrid(walls, 0.05), STRETCH, formula, regions)
     shield = make_shield([synthesise(task, Settings(pitch=0.1))], Config(learn_map=True))
     there = task.grid.occupied.copy()
     there[20, 56:] = True
     bodies = make_body(STRETCH, replace(task.grid, occupied=there)), shield.body
     poses, carry, said = [pose], None, []
     for t in range(task.horizon + 1):
-        gone = t >= 35
+        gone = t >= stays
         points = {"free": someone} if gone else {"occupied": someone}
         decision = decide(shield, poses, None, main_task_done=True, carry=carry, **points)
         carry, said = decision.carry, [*said, decision.mode]
@@ -319,8 +324,49 @@ def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_ha
             assert step(bodies[0], *poses[-1], motion) == step(bodies[1], *poses[-1], motion)
         poses.append(step(bodies[gone], *poses[-1], motion))
     assert decision.spec_status == "satisfied"
-    assert set(said[:35]) == {"fallback"}
-    assert poses[20] == poses[35]
+    assert set(said[:stays]) == {"fallback"}
+    assert poses[20] == poses[stays]
+
+
+@pytest.mark.parametrize("off", [1, -1])
+def test_what_was_touched_is_first_taken_for_what_the_map_has_a_little_elsewhere(off):
+    """A door of 90 cm that is in truth 5 cm farther on one side, and a robot of 70 cm: it touches the frame
+    with one side of its front. With marks all along its front, and half of it, the door is too narrow.
+    """
+
+    def door(left):
+        walls = np.zeros((60, 60), bool)
+        walls[29:31] = True
+        walls[29:31, left : left + 18] = False
+        return OccupancyGrid(walls, 0.05)
+
+    robot = replace(STRETCH, name="broad", radius=0.35, offset=(0.0, 0.0))
+    goal = {"Goal": {"type": "circle", "center": [1.5, 2.4], "radius": 0.2}}
+    policy = synthesise(make_task(door(21), robot, "F[0,13] Goal", goal), Settings(pitch=0.05))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=Uncertainty()))
+    body, poses, carry = make_body(robot, door(21 + off)), [(1.5 - 0.08 * off, 0.7, math.pi / 2)], None
+    for _ in range(14):
+        decision = decide(shield, poses, None, True, carry=carry)
+        carry = decision.carry
+        poses.append(step(body, *poses[-1], int(STRETCH.motion_of[decision.action])))
+    assert decision.map_revision > 0
+    assert decision.spec_status == "satisfied"
+
+
+def test_a_robot_of_small_motions_keeps_more_time_for_a_way_around():
+    """20 steps of a Stretch are 2 m and 300 degrees."""
+
+    def steps(translate, degrees):
+        turn = math.radians(degrees)
+        moves = Action("on", translate), Action("back", -translate)
+        actions = *moves, Action("left", 0.0, turn), Action("wait")
+        robot = Robot("small", 0.1, (0.0, 0.0), "stop", actions)
+        task = make_task(OccupancyGrid(np.zeros((20, 20), bool), 0.05), robot, "G[0,9] x > 0", {})
+        shield = make_shield([plan(task, Plan())], Config(learn_map=True, uncertainty=Uncertainty()))
+        return wary(shield, Care(0.0, 0), Taught(), True).least
+
+    assert [steps(0.2, 30), steps(0.4, 90)] == [20, 20]
+    assert [steps(0.1, 30), steps(0.1, 15), steps(0.1, 45)] == [30, 40, 27]
 
 
 @pytest.mark.parametrize(("learn_map", "later"), [(False, []), (True, None), (True, [])])

@@ -62,9 +62,8 @@ class Config:
             raise InputError(told, path="threshold", got=self.threshold, expected=expected)
         for name, value, unit in (("margin", self.margin, "metres"), ("slack", self.slack, "steps")):
             if not (math.isfinite(value) and value >= 0):
-                raise InputError(
-                    f"the {name} is out of range", path=name, got=value, expected=f"0 or more {unit}"
-                )
+                told = f"the {name} is out of range"
+                raise InputError(told, path=name, got=value, expected=f"0 or more {unit}")
         if self.threshold_over == "episode" and not binary:
             told = "a threshold over the episode is a probability, and evaluation 'robustness' has metres"
             expected = "'step', or evaluation 'feasibility'"
@@ -100,12 +99,10 @@ class Shield:
 def check_preferring(config: Config) -> None:
     """Raises InputError for settings under which a session does not choose within S_t alone."""
     if config.evaluation != "feasibility" or config.threshold != 1.0:
-        raise InputError(
-            "a preference chooses within the feasible set, and these settings leave mass outside it",
-            path="shaping",
-            got=f"evaluation {config.evaluation!r}, threshold {config.threshold:g}",
-            expected="shaping 'projection', or evaluation 'feasibility' with threshold 1",
-        )
+        told = "a preference chooses within the feasible set, and these settings leave mass outside it"
+        got = f"evaluation {config.evaluation!r}, threshold {config.threshold:g}"
+        expected = "shaping 'projection', or evaluation 'feasibility' with threshold 1"
+        raise InputError(told, path="shaping", got=got, expected=expected)
 
 
 def make_shield(
@@ -113,9 +110,8 @@ def make_shield(
 ) -> Shield:
     """A shield for the task that the proposers share. Raises PolicyError where they do not share one."""
     if not proposers:
-        raise PolicyError(
-            "a shield needs a policy", path="policy_ids", got=[], expected="at least one policy"
-        )
+        expected = "at least one policy"
+        raise PolicyError("a shield needs a policy", path="policy_ids", got=[], expected=expected)
     task = proposers[0].task
     for i, policy in enumerate(proposers):
         if policy.task.content_hash != task.content_hash:

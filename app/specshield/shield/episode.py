@@ -56,9 +56,8 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
     try:
         history = _history([pose])
     except (PoseError, ValueError):
-        raise PoseError(
-            "not a pose", path="initial_pose", got=str(list(pose)), expected="finite [x, y, theta]"
-        ) from None
+        got, expected = str(list(pose)), "finite [x, y, theta]"
+        raise PoseError("not a pose", path="initial_pose", got=got, expected=expected) from None
     check_place(shield, history[0], "initial_pose")
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     rho, warnings = np.array([prefix.low]), tuple[str, ...]()
@@ -68,12 +67,10 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
     best = float(rho.max(initial=-np.inf))
     if not best > SATISFIED_ABOVE:
         found = f"the best robustness found is {best:.3f}" if len(rho) else "; ".join(warnings)
-        raise InfeasibleStart(
-            f"no way from here was found that keeps the rule: {found}",
-            path="initial_pose",
-            got=[round(v, 3) for v in pose],
-            expected="a pose from which the rule can be kept; or allow_infeasible",
-        )
+        told = f"no way from here was found that keeps the rule: {found}"
+        expected = "a pose from which the rule can be kept; or allow_infeasible"
+        at = [round(v, 3) for v in pose]
+        raise InfeasibleStart(told, path="initial_pose", got=at, expected=expected)
 
 
 def check_switch(
@@ -248,9 +245,8 @@ def _history(poses: ArrayLike) -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64, order="C")
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not _wrapped(array):
-        raise PoseError(
-            "not poses", path="poses", got=str(poses)[:80], expected="a list of finite [x, y, theta]"
-        )
+        expected = "a list of finite [x, y, theta]"
+        raise PoseError("not poses", path="poses", got=str(poses)[:80], expected=expected)
     return array
 
 

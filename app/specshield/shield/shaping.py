@@ -47,9 +47,8 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
         wrong, expected = "a logit is NaN or +infinity", "a number, or null for -inf"
         raise LogitsError(wrong, path=f"logits[{i}]", got=str(array[i]), expected=expected)
     if i == n:
-        raise LogitsError(
-            "every logit is null", path="logits", got="all null", expected="at least one finite logit"
-        )
+        expected = "at least one finite logit"
+        raise LogitsError("every logit is null", path="logits", got="all null", expected=expected)
     return log_softmax(array)
 
 

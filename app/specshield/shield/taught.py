@@ -53,9 +53,10 @@ from specshield.world.learned import (
     revised,
 )
 
-# [steps] what a way around an obstacle takes that only contacts show, by hand (docs/decisions.md). A robot
-# that has to turn round gets up to as many more: of 30 runs a locobot kept 28 with them, and 22 without.
-AROUND = 20
+# What a way around an obstacle takes that only contacts show, by hand (docs/decisions.md): 20 steps, or what 2 m
+# and 300 degrees take. A robot that has to turn round gets up to 20 more: of 30 runs a locobot kept 28 with
+# them, and 22 without.
+AROUND, AROUND_FAR, AROUND_TURNED = 20, 2.0, math.radians(300.0)
 NEARBY = 2.0  # [m] poses farther away than this say nothing of an obstacle that was run into
 SAME_PLACE = 1e-6  # [m] poses this near differ by rounding alone
 KEPT = 64  # bodies on learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
@@ -191,8 +192,9 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and unsure:
         room = not shield.task.robot.goes_back
-        turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # for half a turn, twice
-        least = max(least, AROUND + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if turn else 0))
+        far, turn = (max(map(abs, each.tolist())) or math.inf for each in displacements(shield.body))
+        around = max(AROUND, math.ceil(AROUND_FAR / far + AROUND_TURNED / turn - 1e-9))
+        least = max(least, around + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if room else 0))
     return Care(care.margin, least, *care[2:5], barred, on_way and unsure, room)
 
 

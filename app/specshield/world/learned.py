@@ -92,9 +92,8 @@ def check_points(points: ArrayLike, path: str) -> Floats:
         got: object = list(array.shape)
     except (TypeError, ValueError):
         got = str(points)[:80]
-    raise SampleError(
-        "not a list of points", path=path, got=got, expected=f"at most {MAX_POINTS} finite [x, y] in metres"
-    )
+    expected = f"at most {MAX_POINTS} finite [x, y] in metres"
+    raise SampleError("not a list of points", path=path, got=got, expected=expected)
 
 
 def learn(

@@ -40,12 +40,8 @@ def _yaw(orientation: Any) -> float:
     path = "info.origin.orientation"
     x, y, z, w = (checks.number(checks.member(orientation, k, path), f"{path}.{k}") for k in "xyzw")
     if abs(x * x + y * y + z * z + w * w - 1) > 1e-3 or math.hypot(x, y) > 1e-3:
-        raise MapError(
-            "a map can be turned about z only",
-            path=path,
-            got=[x, y, z, w],
-            expected="a unit quaternion, x = y = 0",
-        )
+        told, expected = "a map can be turned about z only", "a unit quaternion, x = y = 0"
+        raise MapError(told, path=path, got=[x, y, z, w], expected=expected)
     return 2 * math.atan2(z, w)
 
 

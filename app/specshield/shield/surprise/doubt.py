@@ -8,16 +8,19 @@ import numpy as np
 
 from specshield.robot.dynamics import overlap, step
 from specshield.shield.decision import Shield
+from specshield.shield.escape import spread
 from specshield.shield.feasibility import Futures, Prefix, futures, together
 from specshield.shield.judgement import Judged, Situation
 from specshield.shield.proposal import adapted
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.contact import cells_under
 from specshield.shield.surprise.recovery import most_kept, recovers
-from specshield.shield.taught import Taught, body_on, on_map
-from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
+from specshield.shield.taught import AROUND, Taught, body_on, on_map
+from specshield.stl import Formula
+from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
+BESIDE = 0.1  # [m] from the map's own obstacles, what is believed first; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
 MOST_PARTS = 4  # parts of the rule, which no way keeps together, that are tried one by one; chosen by hand
@@ -48,18 +51,21 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     """What may be believed of the map if no way is left, in the order in which it is to be tried.
 
     A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
-    less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
-    lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
-    before was wrong, so the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
-    forgotten, since no contact shows that an obstacle is gone; then also cells that no sensor has seen again
-    for UNSEEN_AFTER steps, since it may look elsewhere. At last, all that the robot has just passed is free.
+    less is believed than is marked: only what lies beside the map's own obstacles, which may stand a little
+    elsewhere; nothing behind what was touched; only what lies straight ahead; only what lies to the left; only
+    what lies to the right. Each new contact at the same pose shows that the guess before was wrong, so the
+    next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no
+    contact shows that an obstacle is gone; then also cells that no sensor has seen again for UNSEEN_AFTER
+    steps, since it may look elsewhere. At last, all that the robot has just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
-    marked, first = known.occupied & ~sent, max(taught.followed.met - 1, 0) % len(GUESSES)
-    held = [marked & np.isin(known.by, some) for some in GUESSES[first:] + GUESSES[:first]]
+    marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
+    held = [marked & beside & (known.by != BEHIND), *(marked & np.isin(known.by, some) for some in GUESSES)]
+    first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
-    for gone in [*(marked & ~some for some in held if some.any()), old & marked, *([old] if unseen else [])]:
+    less = [marked & ~some for some in held[first:] + held[:first] if some.any()]
+    for gone in [*less, old & marked, *([old] if unseen else [])]:
         if gone.any():
             yield taught._replace(map=revised(known, forget(known, gone)))
     if told.config.learn_map:
@@ -92,7 +98,7 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         if len(parts) == 2 or lost == parts:  # if no part can be kept alone, no two can
             break
     awaited = _awaited(told, shield, taught, now)
-    if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
+    if awaited is not None and _loses(shield, judged.part, tried, awaited) == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
     elif not helps:  # contacts may be the reason
         known, marked = taught.map, taught.map.occupied & (taught.map.by != SENT)
@@ -108,12 +114,18 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
-def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
-    """The futures that begin with the motion `first`, and the one that then waits to the horizon."""
-    still = np.full_like(tried.motions[:1], told.task.robot.wait_motion)
-    still[0, 0] = first
-    motions = np.concatenate([tried.motions[tried.motions[:, 0] == first], still])
-    return tried._replace(motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
+def _loses(shield: Shield, prefix: Prefix, tried: Futures, first: int) -> tuple[Formula, ...]:
+    """What the motion `first` gives up at the least: if the robot then waits to the horizon, if it goes on as
+    one of the futures that were tried, or if it goes back and begins one of them AROUND steps later.
+    """
+    pose, wait = prefix.poses[-1], shield.task.robot.wait_motion
+    ends = spread(shield.body, np.array([step(shield.body, pose[0], pose[1], pose[2], first)]))
+    back = np.argmin(np.hypot(*(ends - pose)[:, :2].T) - np.cos(ends[:, 2] - pose[2]))
+    later = np.hstack([np.tile([first, back, *[wait] * AROUND], (len(tried.motions), 1)), tried.motions])
+    still = np.array([[first, *[wait] * (prefix.steps - 1)]])
+    motions = np.concatenate([tried.motions[tried.motions[:, 0] == first], still, later[:, : prefix.steps]])
+    ways = tried._replace(motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
+    return most_kept(shield, prefix, ways)[1]
 
 
 def _awaited(told: Shield, shield: Shield, taught: Taught, now: Situation) -> int | None:
