@@ -328,6 +328,24 @@ def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_ha
     assert poses[20] == poses[stays]
 
 
+@pytest.mark.parametrize("skin", [0.0, 0.02])
+def test_a_robot_whose_scanner_sees_its_own_body_all_round_is_not_shut_in(skin):
+    """Points on the footprint's edge, or a little outside: they lie under no more than 3 cm of it."""
+    shield, poses, carry = shield_of(30, learn_map=True, uncertainty=Uncertainty()), [START], None
+    around = np.linspace(0.0, 2 * math.pi, 60)
+    ring = (STRETCH.radius + skin) * np.stack([np.cos(around), np.sin(around)], axis=-1)
+    for _ in range(31):
+        x, y, theta = poses[-1]
+        centre = x + STRETCH.offset[0] * math.cos(theta), y + STRETCH.offset[0] * math.sin(theta)
+        decision = decide(shield, poses, None, True, carry=carry, occupied=ring + centre)
+        carry = decision.carry
+        if decision.spec_status != "pending":
+            break
+        assert decision.mode == "completion"
+        poses.append(step(shield.body, *poses[-1], int(STRETCH.motion_of[decision.action])))
+    assert decision.spec_status == "satisfied"
+
+
 @pytest.mark.parametrize("off", [1, -1])
 def test_what_was_touched_is_first_taken_for_what_the_map_has_a_little_elsewhere(off):
     """A door of 90 cm that is in truth 5 cm farther on one side, and a robot of 70 cm: it touches the frame

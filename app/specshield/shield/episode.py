@@ -67,9 +67,8 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
     best = float(rho.max(initial=-np.inf))
     if not best > SATISFIED_ABOVE:
         found = f"the best robustness found is {best:.3f}" if len(rho) else "; ".join(warnings)
-        told = f"no way from here was found that keeps the rule: {found}"
+        told, at = f"no way from here was found that keeps the rule: {found}", [round(v, 3) for v in pose]
         expected = "a pose from which the rule can be kept; or allow_infeasible"
-        at = [round(v, 3) for v in pose]
         raise InfeasibleStart(told, path="initial_pose", got=at, expected=expected)
 
 

@@ -21,6 +21,7 @@ from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget,
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 BESIDE = 0.1  # [m] from the map's own obstacles, what is believed first; chosen by hand
+SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
 MOST_PARTS = 4  # parts of the rule, which no way keeps together, that are tried one by one; chosen by hand
@@ -50,13 +51,14 @@ def tried_again(
 def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     """What may be believed of the map if no way is left, in the order in which it is to be tried.
 
-    A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
-    less is believed than is marked: only what lies beside the map's own obstacles, which may stand a little
-    elsewhere; nothing behind what was touched; only what lies straight ahead; only what lies to the left; only
-    what lies to the right. Each new contact at the same pose shows that the guess before was wrong, so the
-    next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no
-    contact shows that an obstacle is gone; then also cells that no sensor has seen again for UNSEEN_AFTER
-    steps, since it may look elsewhere. At last, all that the robot has just passed is free.
+    What a sensor sees all around the footprint is the robot itself. A motion that stopped short met something,
+    but nobody knows where along its front, nor how large it is. So less is believed than is marked: only what
+    lies beside the map's own obstacles, which may stand a little elsewhere; nothing behind what was touched;
+    only what lies straight ahead; only what lies to the left; only what lies to the right. Each new contact at
+    the same pose shows that the guess before was wrong, so the next one is tried first. Then contacts of
+    DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle is gone; then
+    also cells that no sensor has seen again for UNSEEN_AFTER steps, since it may look elsewhere. At last, all
+    that the robot has just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
@@ -64,10 +66,15 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
+    around = cells_under(body, prefix.poses[-1], -SKIN)
+    dy, dx = (each - each.sum() / max(len(around), 1) for each in np.divmod(around, told.task.grid.width))
+    eighth = 4 * (dy > 0) + 2 * (dx > 0) + (np.abs(dy) > np.abs(dx))
+    seen = np.isin(around, known.cell[known.occupied & sent])
+    itself = np.isin(known.cell, around[seen]) & (len(np.unique(eighth[seen])) == 8)
     less = [marked & ~some for some in held[first:] + held[:first] if some.any()]
-    for gone in [*less, old & marked, *([old] if unseen else [])]:
+    for gone in [itself, *less, old & marked, *([old] if unseen else [])]:
         if gone.any():
-            yield taught._replace(map=revised(known, forget(known, gone)))
+            yield taught._replace(map=revised(known, forget(known, gone | itself)))
     if told.config.learn_map:
         recent = prefix.poses[max(t - DOUBTED_AFTER, taught.here) :]
         under = [cells_under(body, pose, 0.0) for pose in recent if overlap(body, *pose) > 0.0]
