@@ -60,8 +60,8 @@ def drain_at_sigterm(startup: Startup, seconds: float) -> None:
 
 
 def notice_killed() -> None:
-    """From now on uvicorn's supervisor closes its own copy of a worker's end of the pipe between them, and the
-    metrics forget the streams of a worker that has ended.
+    """From now on uvicorn's supervisor closes its own copy of a worker's end of the pipe between them, and
+    the metrics forget the streams of a worker that has ended.
 
     The supervisor asks each worker for a sign of life through that pipe. While the copy is open, it does not
     notice that a worker is killed meanwhile, and waits for as long as a worker may take to start.

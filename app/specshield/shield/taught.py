@@ -53,9 +53,9 @@ from specshield.world.learned import (
     revised,
 )
 
-# What a way around an obstacle takes that only contacts show, by hand (docs/decisions.md): 20 steps, or what 2 m
-# and 300 degrees take. A robot that has to turn round gets up to 20 more: of 30 runs a locobot kept 28 with
-# them, and 22 without.
+# What a way around an obstacle takes that only contacts show, by hand (docs/decisions.md): 20 steps, or what
+# 2 m and 300 degrees take. A robot that has to turn round gets up to 20 steps more: of 30 runs a
+# locobot kept 28 with them, and 22 without.
 AROUND, AROUND_FAR, AROUND_TURNED = 20, 2.0, math.radians(300.0)
 NEARBY = 2.0  # [m] poses farther away than this say nothing of an obstacle that was run into
 SAME_PLACE = 1e-6  # [m] poses this near differ by rounding alone

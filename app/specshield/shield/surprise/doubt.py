@@ -51,14 +51,14 @@ def tried_again(
 def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     """What may be believed of the map if no way is left, in the order in which it is to be tried.
 
-    What a sensor sees all around the footprint is the robot itself. A motion that stopped short met something,
-    but nobody knows where along its front, nor how large it is. So less is believed than is marked: only what
-    lies beside the map's own obstacles, which may stand a little elsewhere; nothing behind what was touched;
-    only what lies straight ahead; only what lies to the left; only what lies to the right. Each new contact at
-    the same pose shows that the guess before was wrong, so the next one is tried first. Then contacts of
-    DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle is gone; then
-    also cells that no sensor has seen again for UNSEEN_AFTER steps, since it may look elsewhere. At last, all
-    that the robot has just passed is free.
+    What a sensor sees all around the footprint is the robot itself. A motion that stopped short met
+    something, but nobody knows where along its front, nor how large it is. So less is believed than is
+    marked: only what lies beside the map's own obstacles, which may stand a little elsewhere; nothing behind
+    what was touched; only what lies straight ahead; only what lies to the left; only what lies to the right.
+    Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
+    Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
+    is gone; then also cells that no sensor has seen again for UNSEEN_AFTER steps, since it may look
+    elsewhere. At last, all that the robot has just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
