@@ -258,10 +258,14 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
 def test_workers_on_a_cluster_take_runs_too(serial, tmp_path):
     asked = ["evaluate", "--case", "1", "--runs", "1", "--noise", "gaussian", "--seed", "5"]
     with cluster(tmp_path / "nodes") as store:
-        process = worker(store.url, tmp_path / "data")
+        environment = {**os.environ, "REDIS_URL": store.url, "SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+        command = [sys.executable, "-m", "specshield.cli", "worker"]  # not forked: see READ_AT_IMPORT
+        process = subprocess.Popen(command, env=environment)
         try:
             names = f"*workers:{QUEUE}"
-            wait_for(lambda: any([*node.scan_iter(names)] for node in store.nodes))
+            nodes = store.nodes
+            wait_for(lambda: process.poll() is not None or any([*node.scan_iter(names)] for node in nodes))
+            assert process.poll() is None, "the worker has ended"
             asked += ["--methods", ",".join(METHODS), "--redis", store.url, "--out", str(tmp_path / "out")]
             done = subprocess.run([sys.executable, "-m", "evaluation", *asked], timeout=HUNG)
             assert done.returncode == 0
