@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 from urllib.parse import quote
 
 from specshield.client.models import Pose
@@ -33,7 +33,6 @@ from specshield.errors import (
 )
 
 
-@runtime_checkable
 class Array(Protocol):
     """Any array (numpy, torch, array.array), known by its `tolist`."""
 
@@ -161,7 +160,7 @@ def pose_values(pose: Numbers, where: str = "pose") -> Pose:
 
 def point_values(points: Points, where: str) -> list[list[float]]:
     """Points (x, y) [m], map frame. Raises InputError unless each is two numbers up to `FARTHEST`."""
-    listed = points.tolist() if isinstance(points, Array) else points
+    listed = points.tolist() if hasattr(points, "tolist") else points
     if not isinstance(listed, Iterable):
         raise InputError("these are no points", path=where, got=listed, expected="a list of points [x, y]")
     told = "a point is two finite numbers x, y"
@@ -202,7 +201,7 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
 def check_flags(**flags: object) -> None:
     """Raises InputError unless each is True, False or None."""
     for name, flag in flags.items():
-        if (flag.tolist() if isinstance(flag, Array) else flag) not in (True, False, None):
+        if (flag.tolist() if hasattr(flag, "tolist") else flag) not in (True, False, None):
             raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
 
 
