@@ -20,7 +20,7 @@ from specshield.stl import Formula
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
-BESIDE = 0.1  # [m] from the map's own obstacles, what is believed first; chosen by hand
+BESIDE = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
 SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
@@ -53,8 +53,8 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
 
     What a sensor sees all around the footprint is the robot itself. A motion that stopped short met
     something, but nobody knows where along its front, nor how large it is. So less is believed than is
-    marked: only what lies beside the map's own obstacles, which may stand a little elsewhere; nothing behind
-    what was touched; only what lies straight ahead; only what lies to the left; only what lies to the right.
+    marked: nothing behind what was touched; only what lies beside the map's own obstacles, which may stand a
+    little elsewhere; only what lies straight ahead; only what lies to the left; only what lies to the right.
     Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
     Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
     is gone; then also cells that no sensor has seen again for UNSEEN_AFTER steps, since it may look
@@ -62,7 +62,8 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
-    held = [marked & beside & (known.by != BEHIND), *(marked & np.isin(known.by, some) for some in GUESSES)]
+    held = [marked & np.isin(known.by, some) for some in GUESSES]
+    held.insert(1, marked & beside & (known.by != BEHIND))
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
