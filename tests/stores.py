@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 import redis
 
 from tests.serving import free_port, wait_for
 
+needs_redis = pytest.mark.skipif(
+    shutil.which("redis-server") is None, reason="redis-server is not on the PATH: these tests start it"
+)
 DURABLE = ("--appendonly", "yes", "--appendfsync", "everysec", "--save", "")
 
 

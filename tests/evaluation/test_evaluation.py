@@ -30,7 +30,7 @@ from specshield.sim.cases import load_case
 from specshield.world.regions import signed_distance
 from tests.oracles.judge import margin
 from tests.serving import HUNG, Forked, children, command_line, wait_for
-from tests.stores import cluster
+from tests.stores import cluster, needs_redis
 
 EXPERIMENT = Experiment("case1", noise="gaussian", seed=5)
 METHODS = ["unmodified", "ours@0.03/8"]
@@ -254,7 +254,7 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
         process.wait(HUNG)
 
 
-@pytest.mark.skipif(shutil.which("redis-server") is None, reason="redis-server is not installed")
+@needs_redis
 def test_workers_on_a_cluster_take_runs_too(serial, tmp_path):
     asked = ["evaluate", "--case", "1", "--runs", "1", "--noise", "gaussian", "--seed", "5"]
     with cluster(tmp_path / "nodes") as store:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -24,11 +23,9 @@ from specshield.service.storage.store import Change, Record, Store
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
 from tests.serving import HUNG, RunningServer, run_specshield, serving, wait_for
-from tests.stores import Cluster, behind_tls, cluster, watched
+from tests.stores import Cluster, behind_tls, cluster, needs_redis, watched
 
-pytestmark = pytest.mark.skipif(
-    shutil.which("redis-server") is None, reason="redis-server is not installed: stores of one's own need it"
-)
+pytestmark = needs_redis
 POSE = [4.5, 5.0, 0.0]
 FIRST = 16384 // 3  # slots of the cluster's first master, whose replica takes over
 STEPS = 12

@@ -73,11 +73,11 @@ def _case(id: str, name: str, target: tuple[float, float] | None, seed: int) -> 
     policies = Policies(settings, maps)
     about = policies.record(id).about
     task = policies.task(about)
-    drawn = free_poses(task, make_body(task.robot, task.grid), 1, np.random.default_rng([seed, 1]))
-    place = target or (float(drawn[0, 0]), float(drawn[0, 1]))
-    case = Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
-    if target is not None and (not task.grid.holds(place) or task.grid.occupied[case.cell(place)]):
-        told = f"{place[0]:g},{place[1]:g}"
+    body, random = make_body(task.robot, task.grid), np.random.default_rng([seed, 1])
+    x, y = target or free_poses(task, body, 1, random)[0, :2].tolist()
+    case = Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point((x, y))}", (x, y))
+    if target is not None and (not task.grid.holds((x, y)) or task.grid.occupied[case.cell((x, y))]):
+        told = f"{x:g},{y:g}"
         raise InputError("no robot can stand there", path="--target", got=told, expected="a free place")
     return case
 

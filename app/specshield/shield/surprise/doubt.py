@@ -57,8 +57,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     little elsewhere; only what lies straight ahead; only what lies to the left; only what lies to the right.
     Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
     Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
-    is gone; then also cells that no sensor has seen again for UNSEEN_AFTER steps, since it may look
-    elsewhere. At last, all that the robot has just passed is free.
+    is gone; then cells that no sensor saw again for UNSEEN_AFTER steps. At last, all just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
@@ -67,6 +66,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
+    # A ring around the robot is the robot itself; a thing beside it lies in fewer eighths of a circle.
     around = cells_under(body, prefix.poses[-1], -SKIN)
     dy, dx = (each - each.sum() / max(len(around), 1) for each in np.divmod(around, told.task.grid.width))
     eighth = 4 * (dy > 0) + 2 * (dx > 0) + (np.abs(dy) > np.abs(dx))
