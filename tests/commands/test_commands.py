@@ -226,6 +226,18 @@ def test_no_help_has_a_word_in_brackets_which_would_be_taken_for_markup_and_not_
                     assert not re.search(r"\[[a-z#/@]", told.help or ""), (of.__name__, name)
 
 
+class WithoutDate(BaseHTTPRequestHandler):
+    """A server behind something that writes a Date of its own."""
+
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(b'{"status": "ok"}')
+
+    def date_time_string(self, timestamp=None):
+        return "today"
+
+
 def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
     sound = run_specshield("doctor", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert sound.returncode == 0, sound.stdout
@@ -238,7 +250,12 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
         Thread(target=other.serve_forever, daemon=True).start()
         lost = run_specshield("doctor", "--url", f"http://127.0.0.1:{other.server_port}/")
         other.shutdown()
+    with HTTPServer(("127.0.0.1", 0), WithoutDate) as other:
+        Thread(target=other.serve_forever, daemon=True).start()
+        undated = run_specshield("doctor", "--url", f"http://127.0.0.1:{other.server_port}/")
+        other.shutdown()
     assert re.search(r"^wrong +what answers at \S+ is no specshield server", lost.stdout, re.M), lost.stderr
+    assert re.search(r"^ok +the server at \S+ is ready", undated.stdout, re.M), undated.stderr
     assert ill.returncode == 1
     assert f"port {port} cannot be served on: Address already in use\n" in ill.stdout
     parted = run_specshield(

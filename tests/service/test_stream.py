@@ -60,6 +60,7 @@ def test_what_a_caller_does_not_take_is_not_what_is_answered(client, begin):
         ("application/msgpack; q=0.0, application/json", "application/json"),
         ("*/*", "application/json"),
         ("application/msgpack;q=0.5", "application/msgpack"),
+        ("Application/MsgPack", "application/msgpack"),
         ("application/json;q=0.1, application/msgpack", "application/msgpack"),
     ):
         answer = client.post(path, json=body(0), headers={"Accept": accept})

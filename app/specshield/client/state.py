@@ -39,6 +39,7 @@ from specshield.errors import (
     SpecshieldError,
     StepConflict,
 )
+from specshield.wiring import Wiring
 
 
 class SessionState:
@@ -69,6 +70,7 @@ class SessionState:
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
         self._circuit = Circuit()
+        self._wiring = Wiring(info.id)
         # The step for which the service may have an x_t without our knowing: it was sent without an answer,
         # by a former user of the session, or with a switch. -1: there is none.
         self._unanswered = info.next_t if initial_pose is None else -1
@@ -210,6 +212,7 @@ class SessionState:
         self.finished = decision.finished or (ends and decision.spec_status != "pending")
         if self.on_failure == "witness":
             self._continuation.learn(decision, poses[t])
+        self._wiring.note(t, poses[t], decision, executed=own)
         return decision
 
     def _recall(self) -> Flow[None]:
@@ -247,7 +250,7 @@ class SessionState:
         info = build(SessionInfo, wire.json_object(reply))
         self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
         self._heard[:] = info.rules
-        self._poses, self._continuation = poses, Continuation(info.margin)
+        self._poses, self._continuation, self._wiring = poses, Continuation(info.margin), Wiring(self.id)
         self._stored = max(self._stored, self.t + (x_t is not None))
         return info
 

@@ -222,9 +222,9 @@ def _server(url: str) -> Iterator[Finding]:
             f"the server is specshield {theirs}, this is {__version__}",
             "the same version on both sides",
         )
-    date = ready.headers.get("date")
+    date = email.utils.parsedate_tz(ready.headers.get("date"))
     if date is not None:
-        apart = email.utils.parsedate_to_datetime(date).timestamp() - began
+        apart = email.utils.mktime_tz(date) - began
         if abs(apart) > CLOCK + 1.0:  # the header has whole seconds
             yield Finding("note", f"the server's clock is {apart:+.0f} s from this one", "use ntp on both")
 

@@ -34,6 +34,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.signals import any_signal
 from specshield.shield.surprise.slip import SAME_POSE
 from specshield.task import Task, check_signals
+from specshield.wiring import Wiring
 
 if TYPE_CHECKING:
     from specshield.local.shield import LocalShield
@@ -68,6 +69,7 @@ class LocalSession:
         self._rules = [Rule(policy, shield)]
         self._first = dict(shield.task.signals)
         self._carry = handover.begun(way)
+        self._wiring = Wiring(info.id)
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
@@ -139,6 +141,7 @@ class LocalSession:
         )
         answer = _answer(made._replace(t=self.t), self.info, over, witnesses, explain)
         self._carry, self._decisions[self.t] = made.carry, answer
+        self._wiring.note(self.t, x_t, answer, executed=main_task_done is None)
         self._arrived(x_t, held)
         self.spec_status = answer.spec_status
         ends = main_task_done is None and answer.action in self.info.terminal_actions
@@ -191,6 +194,7 @@ class LocalSession:
             any_signal=any_signal(rule.shield, seen, signals),
         )
         self._rules.append(rule)
+        self._wiring = Wiring(self.id)
         self._carry, self._first = carry._replace(way=way), first
         self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}

@@ -1,0 +1,182 @@
+"""Finds what a robot's loop got wrong for good: a sign, a unit, a frame, the order of actions, old poses.
+
+No rule can be kept for a robot that turns right where `left` is executed. Noise, slips and contacts hinder
+single motions; such a mistake shows in nearly all of them, and always in the same way.
+"""
+
+from __future__ import annotations
+
+import cmath
+import logging
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:  # the SDK imports this module
+    from specshield.client.models import Decision, Pose
+
+KEPT = 24  # [motions] looked at: a mistake shows in a few seconds, and one of long ago does not count
+ENOUGH = 6  # [motions] that only the mistake explains; chosen by hand
+# By how much a motion may differ and still count as executed: a part of its length, plus three times the
+# noise of a robot (0.01 m and 0.5 degrees) and as much for its localisation.
+PART, FAR, TURNED = 0.3, 0.06, 0.05  # [m], [rad]
+log = logging.getLogger("specshield")
+
+
+class Motion(NamedTuple):
+    """A step by which the robot was to move, in the frame of the robot before it: forward [m] + left [m] i,
+    and a turn to the left [rad]. told: by the action that was executed. leads: where each action leads.
+    """
+
+    action: int
+    told: tuple[complex, float]
+    found: tuple[complex, float]
+    before: Pose
+    leads: tuple[Pose, ...]
+
+
+Mistake = Callable[[int], tuple[complex, float] | None]  # what it makes of motion i, None if it does not say
+
+
+class Wiring:
+    """What the last motions of a session led to. A mistake that they show is logged, once."""
+
+    def __init__(self, session: str) -> None:
+        self._session = session
+        self._last: tuple[int, Pose, Decision] | None = None
+        self._motions: deque[Motion] = deque(maxlen=KEPT)
+        self._told = False
+
+    def note(self, t: int, pose: Pose, decision: Decision, executed: bool) -> None:
+        """Notes x_t and the decision there. executed: whether its `execute` is what the robot will run."""
+        last, self._last = self._last, (t, pose, decision) if executed else None
+        if self._told or last is None or last[0] + 1 != t:
+            return
+        before, action = last[1], last[2].execute
+        leads = last[2].next_poses
+        motion = Motion(action, between(before, leads[action]), between(before, pose), before, leads)
+        if motion.told == (0j, 0.0):
+            return
+        self._motions.append(motion)
+        if alike(motion.found, motion.told):
+            return
+        if (wrong := diagnosed(self._motions, last[2].action_names)) is not None:
+            self._told = True
+            log.warning("session %s: %s", self._session, wrong)
+
+
+def between(before: Pose, after: Pose) -> tuple[complex, float]:
+    """The motion between two poses in the frame of the first: forward + left i [m], a turn left [rad]."""
+    way = complex(after[0] - before[0], after[1] - before[1]) * cmath.exp(-1j * before[2])
+    return way, math.remainder(after[2] - before[2], math.tau)
+
+
+def alike(one: tuple[complex, float], other: tuple[complex, float]) -> bool:
+    """Whether the first motion may be the second, with noise."""
+    turned = abs(math.remainder(one[1] - other[1], math.tau))
+    near = abs(one[0] - other[0]) <= FAR + PART * abs(other[0])
+    return near and turned <= TURNED + PART * abs(other[1])
+
+
+def diagnosed(motions: Sequence[Motion], names: Sequence[str]) -> str | None:
+    """The mistake that explains at least ENOUGH motions that were not executed as told, and three quarters of
+    all such, while it contradicts next to none of those that were. None if there is no such mistake.
+    """
+    kept = [alike(each.found, each.told) for each in motions]
+    if kept.count(False) < ENOUGH:
+        return None
+    best, words = ENOUGH - 1, None
+    for told, mistake in mistakes(motions, names):
+        made = [mistake(i) for i in range(len(motions))]
+        explains = [each is not None and alike(motions[i].found, each) for i, each in enumerate(made)]
+        only = sum(yes and not was for yes, was in zip(explains, kept, strict=True))
+        against = sum(was and not yes for yes, was in zip(explains, kept, strict=True))
+        if only > best and only >= 0.75 * kept.count(False) and 8 * against <= only:
+            best, words = only, told
+    return words
+
+
+def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[str, Mistake]]:
+    """The mistakes that are looked for, in words, each with what it makes of the motions."""
+
+    def changed(way: Callable[[Motion], complex], turn: float = 1.0) -> Mistake:
+        return lambda i: (way(motions[i]), turn * motions[i].told[1])
+
+    def over(each: Motion, mirrored: Callable[[complex], complex]) -> complex:
+        """The stride with its direction on the map mirrored."""
+        on_map = cmath.exp(1j * each.before[2])
+        return mirrored(each.told[0] * on_map) / on_map
+
+    yield (
+        "the poses do not change: send the robot's new pose at each step; or something holds the robot",
+        lambda i: (0j, 0.0),
+    )
+    yield (
+        "the poses are a step old: each shows what the motion before the last one did; send the pose "
+        "once the motion has ended",
+        lambda i: motions[i - 1].told if i else None,
+    )
+    yield (
+        "the robot turns the other way: theta and `rotate` grow counter-clockwise, on a map whose y axis "
+        "points up; or its actions for left and right are exchanged",
+        changed(lambda each: each.told[0], -1.0),
+    )
+    yield "the robot moves backwards where it should move forward", changed(lambda each: -each.told[0])
+    yield (
+        "the y axis of the poses points the other way than that of the map",
+        changed(lambda each: over(each, complex.conjugate)),
+    )
+    yield (
+        "x and y of the poses are exchanged",
+        changed(lambda each: over(each, lambda way: 1j * way.conjugate())),
+    )
+    strides = [each for each in motions if min(abs(each.told[0]), abs(each.found[0])) > FAR]
+    if strides:
+        aside = cmath.phase(sum(each.found[0] / each.told[0] / abs(each.found[0]) for each in strides))
+        where = f"{abs(math.degrees(aside)):.0f} degrees to the {'left' if aside > 0 else 'right'}"
+        yield (
+            f"the robot moves {where} of its heading: theta is 0 where it looks along the map's x axis",
+            changed(lambda each: each.told[0] * cmath.exp(1j * aside)),
+        )
+        longer = _middle(abs(each.found[0]) / abs(each.told[0]) for each in strides)
+        yield (
+            f"the robot's strides are {longer:.2g} times as long as its actions say; poses and `translate` "
+            "are in metres",
+            changed(lambda each: longer * each.told[0]),
+        )
+    turns = [each for each in motions if abs(each.told[1]) > TURNED]
+    if turns:
+        wider = _middle(each.found[1] / each.told[1] for each in turns)
+        yield (
+            f"the robot's turns are {wider:.2g} times as wide as its actions say; theta and `rotate` are in "
+            "radians",
+            changed(lambda each: each.told[0], wider),
+        )
+    done = {action: _done(motions, action) for action in {each.action for each in motions}}
+    exchanged = [
+        f"{names[a]!r} does what {names[b]!r} should do" for a, b in done.items() if b not in (a, None)
+    ]
+    if names and exchanged:
+        yield (
+            f"the actions have another order: {', and '.join(exchanged)}",
+            lambda i: (
+                None if (b := done[(was := motions[i]).action]) is None else between(was.before, was.leads[b])
+            ),
+        )
+
+
+def _done(motions: Sequence[Motion], action: int) -> int | None:
+    """The action that most of the motions look like that were to be `action`; None if they look like none."""
+    like = Counter(
+        next((b for b, to in enumerate(each.leads) if alike(each.found, between(each.before, to))), None)
+        for each in motions
+        if each.action == action and abs(each.found[0]) + abs(each.found[1]) > TURNED
+    )
+    return like.most_common(1)[0][0] if like else None
+
+
+def _middle(values: Iterable[float]) -> float:
+    """The upper median. To import the library's takes a hundredth of a second."""
+    ordered = sorted(values)
+    return ordered[len(ordered) // 2]
