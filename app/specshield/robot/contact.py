@@ -56,7 +56,7 @@ def room_around(body: Body, u: float, v: float) -> float:
     return float(body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h))
 
 
-@leaf
+@inlined
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
     h = body.resolution
@@ -138,7 +138,7 @@ def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: floa
     return max(-along - math.sqrt(root), 0.0)
 
 
-@leaf
+@inlined
 def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length: float, r: float) -> float:
     """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
     h = body.resolution
@@ -200,7 +200,7 @@ def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float)
     return length
 
 
-@leaf
+@inlined
 def _arc_contact(body: Body, ou: float, ov: float, u: float, v: float, angle: float, r: float) -> bool:
     """Whether a disc of radius r overlaps an occupied square while its centre turns about (ou, ov), by
     `angle` [rad] from (u, v), where it overlaps none.

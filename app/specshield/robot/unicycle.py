@@ -14,7 +14,7 @@ from specshield.robot.body import Body, centre, wrap
 from specshield.robot.contact import TOUCH, can_turn, room_around, way_ahead
 
 
-@leaf
+@inlined
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
     """f: the pose after one motion (an index into `Robot.motions`). theta in and out in (-pi, pi]."""
     cos, sin, room = around(body, x, y, theta)
@@ -56,7 +56,7 @@ def unhindered(
     return nx, ny, wrap(theta + angle) if angle != 0.0 else theta
 
 
-@leaf
+@inlined
 def _end(
     body: Body, x: float, y: float, theta: float, motion: int, moved: float
 ) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import FragmentError
 from specshield.policy.progress.obligations import obligations
 from specshield.policy.progress.values import fill_place, fill_signals, initial_signals
@@ -63,7 +63,7 @@ def value_count(rules: Rules) -> int:
     return int(REGIONS + rules.regions.plain.shape[0] + rules.signals.shape[0])
 
 
-@leaf
+@inlined
 def read_predicates(
     rules: Rules, x: float, y: float, theta: float, values: Floats, stack: Floats, out: Floats
 ) -> None:
@@ -74,7 +74,7 @@ def read_predicates(
         out[k] = evaluate_packed(k, rules.programs, values, stack)
 
 
-@leaf
+@inlined
 def advance(rules: Rules, t: int, predicates: Floats, status: Int8s, run: Ints) -> None:
     """Takes the state at step t into the progress, in place.
 
