@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numba.core.caching import IndexDataCacheFile
 
-from specshield.policy.dqn.network import Network
+from specshield.policy.dqn.network import NAMES, Network, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.progress import make_rules
@@ -137,7 +137,8 @@ def _network(task: Task) -> Network:
     body = make_body(task.robot, task.grid)
     inputs, outputs = observation_size(make_rules(task), body), motion_count(body)
     shapes = ((inputs, 4), 4, (4, 4), 4, (4, outputs), outputs)
-    return Network(*(np.zeros(shape, np.float32) for shape in shapes))
+    weights = {name: np.zeros(shape, np.float32) for name, shape in zip(NAMES, shapes, strict=True)}
+    return make_network(weights, inputs, outputs)
 
 
 def _keep_all() -> None:

@@ -30,14 +30,22 @@ def test_a_tiny_network_by_hand():
     assert layers.q.tolist() == [-1.0, 12.5]
 
 
-def test_every_input_counts_once():
-    """Inputs are summed eight at a time and the rest one by one."""
-    for count in range(1, 20):
-        powers = 2.0 ** np.arange(count)
-        net = make_network(arrays(powers[:, None], [0], [[1]], [0], [[1]], [0]), count, 1)
-        layers = make_layers(net)
-        greedy(net, np.ones(count, np.float32), layers)
-        assert layers.q[0] == 2.0**count - 1.0
+def test_every_sum_is_made_in_the_order_of_its_inputs():
+    """To the last bit, for layers that registers hold in part: numpy adds one product after the other."""
+    random = np.random.default_rng(0)
+    for inputs, first, second, outputs in [*((n, n, 20 - n, n) for n in range(1, 20)), (58, 64, 72, 7)]:
+        shapes = ((inputs, first), first, (first, second), second, (second, outputs), outputs)
+        weights = arrays(*(random.normal(0, 1, shape) for shape in shapes))
+        x = random.normal(0, 1, inputs).astype(np.float32)
+        layers = make_layers(net := make_network(weights, inputs, outputs))
+        best, expected = greedy(net, x, layers), x
+        for i, layer in enumerate((layers.h1, layers.h2, layers.q), start=1):
+            total = weights[f"b{i}"].copy()
+            for value, row in zip(expected, weights[f"w{i}"], strict=True):
+                total += value * row
+            expected = np.maximum(total, np.float32(0)) if i < 3 else total
+            assert layer.tolist() == expected.tolist()
+        assert best == np.argmax(expected)
 
 
 def test_the_lowest_index_wins_ties():

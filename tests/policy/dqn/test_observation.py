@@ -12,6 +12,7 @@ from specshield.policy.dqn.observation import PER_MOTION, arrive, observation_si
 from specshield.policy.dqn.scene import make_scene
 from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.robot import STRETCH
+from specshield.robot.dynamics import successors
 from tests.policy.rooms import CUSTOM, corridor, flat, in_state
 
 HALF = math.sqrt(0.5)
@@ -71,6 +72,22 @@ def test_an_always_that_does_not_hold_yet_makes_no_motion_unsafe():
     pose = (1.25, 0.75, math.pi / 2)
     assert seen("F[0,20] End and G[7,20] y < 0.9", pose, 5)[22] == 1.0
     assert seen("F[0,20] End and G[7,20] y < 0.9", pose, 6)[22] == -1.0  # it holds at the next step
+
+
+def test_what_is_left_as_it_was_is_what_would_be_written_anew():
+    """Along drawn ways on which the robot often stands or turns, and windows begin and end meanwhile."""
+    formula = "F[3,9] End and F[0,30] G[0,2] x < 1 and G[6,14] x < 1.4 and G[0,30] y > 0"
+    scene = make_scene(corridor(formula))
+    for seed in range(10):
+        way, random = in_state(scene, (1.25, 0.75, 0.0)), np.random.default_rng(seed)
+        for t in range(1, 30):
+            observe(scene, t - 1, way)
+            fresh = in_state(scene, way.pose.tolist(), status=way.status, run=way.run)
+            observe(scene, t - 1, fresh)
+            assert way.observation.tolist() == fresh.observation.tolist(), (seed, t)
+            moved = arrive(scene.rules, t, *way.nexts[random.choice([0, 0, 0, 1, 2, 3])], way)
+            assert moved == (way.pose.tolist() != fresh.pose.tolist())
+            successors(scene.body, way.pose, way.nexts)
 
 
 def test_arriving_takes_a_state_into_the_progress():

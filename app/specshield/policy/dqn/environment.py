@@ -16,15 +16,7 @@ from specshield.arrays import Bools, Floats, Int8s, Ints, Singles
 from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.policy.dqn.funnel import Funnels, make_funnels, reward
-from specshield.policy.dqn.observation import (
-    State,
-    arrive,
-    make_state,
-    observation_size,
-    observe,
-    outcome,
-    place,
-)
+from specshield.policy.dqn.observation import State, make_state, observation_size, observe, outcome, place
 from specshield.policy.dqn.scene import Scene, make_scene, predicates_at
 from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, advance
 from specshield.robot.dynamics import Body, in_collision, motion_count, successors
@@ -154,12 +146,16 @@ def _step_all(
             scratch.values,
             scratch.stack,
             scratch.after,
+            scratch.far,
+            scratch.seen,
         )
+        scratch.seen[:] = np.nan
         over = t[i] >= scene.horizon
         if not over:
             t[i] += 1
             m = motions[i]
-            arrive(rules, t[i], state.nexts[m, 0], state.nexts[m, 1], state.nexts[m, 2], state)
+            place(rules, state.nexts[m, 0], state.nexts[m, 1], state.nexts[m, 2], state)
+            advance(rules, t[i], state.predicates, state.status, state.run)
             rewards[i] = reward(scene, funnels, t[i], state)
             over = t[i] >= scene.horizon
             if outcome(state.status) == BROKEN:

@@ -6,17 +6,23 @@ It takes one observation at a time, because a batch's answer could depend on the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from specshield.arrays import Singles, copy_row
+from specshield.arrays import Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import PolicyError
 
+build: Any = cgutils  # its functions have no types
 NAMES = ("w1", "b1", "w2", "b2", "w3", "b3")
 MAX_UNITS = 1024  # of a layer; bounds the time of a decision with weights that come from outside
+MANY, FEW = 64, 8  # outputs that are summed at once: what half of the registers hold, and what one holds
+LINE = 16  # numbers that a processor reads at once: weights that lie across two lines took a third longer
 
 
 class Network(NamedTuple):
@@ -57,13 +63,22 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
                     expected=f"finite float32 {list(shape)}, at most {MAX_UNITS} units",
                 )
         before = after
-    return Network(*(np.ascontiguousarray(weights[name]) for name in NAMES))
+    return Network(*(_roomy(weights[name]) for name in NAMES))
+
+
+def _roomy(array: NDArray[np.generic]) -> Singles:
+    """A copy that begins with a line, and after which FEW more numbers can be read."""
+    room = np.zeros(array.size + LINE + FEW, np.float32)
+    copy = room[-(room.ctypes.data // 4) % LINE :][: array.size].reshape(array.shape)
+    copy[...] = array
+    return copy
 
 
 @kernel
 def make_layers(net: Network) -> Layers:
-    h1, h2 = np.empty(net.b1.shape[0], np.float32), np.empty(net.b2.shape[0], np.float32)
-    return Layers(h1, h2, np.empty(net.b3.shape[0], np.float32))
+    h1, h2, h3 = net.b1.shape[0], net.b2.shape[0], net.b3.shape[0]
+    room = np.empty((3, max(h1, h2, h3) + FEW), np.float32)
+    return Layers(room[0, :h1], room[1, :h2], room[2, :h3])
 
 
 @leaf
@@ -83,18 +98,50 @@ def greedy(net: Network, observation: Singles, layers: Layers) -> int:
 
 @inlined
 def _layer(x: Singles, w: Singles, b: Singles, out: Singles) -> None:
-    """out = b + x w, each sum in the inputs' order; eight inputs a pass, so that sums stay in registers."""
-    copy_row(b, out)
-    whole = x.shape[0] - x.shape[0] % 8
-    for i in range(0, whole, 8):
-        x0, x1, x2, x3 = x[i], x[i + 1], x[i + 2], x[i + 3]
-        x4, x5, x6, x7 = x[i + 4], x[i + 5], x[i + 6], x[i + 7]
-        for j in range(out.shape[0]):
-            total = out[j] + x0 * w[i, j] + x1 * w[i + 1, j] + x2 * w[i + 2, j] + x3 * w[i + 3, j]
-            out[j] = total + x4 * w[i + 4, j] + x5 * w[i + 5, j] + x6 * w[i + 6, j] + x7 * w[i + 7, j]
-    for i in range(whole, x.shape[0]):
-        for j in range(out.shape[0]):
-            out[j] += x[i] * w[i, j]
+    """out = b + x w, each sum in the inputs' order. Writes up to FEW - 1 numbers more than `out` has."""
+    whole = b.shape[0] - b.shape[0] % MANY
+    for j in range(0, whole, MANY):
+        _many_sums(x, w, b, j, out)
+    for j in range(whole, b.shape[0], FEW):
+        _few_sums(x, w, b, j, out)
+
+
+def _sums(count: int) -> Any:
+    """A function (x, w, b, j, out) for kernels: `_layer` for `count` outputs, from the j-th on.
+
+    LLVM's own code for such loops writes the sums to memory after every few inputs, and takes half as long
+    again. These stay in registers. Products are rounded before they are added, as in any other kernel.
+    """
+    vector, first = ir.VectorType(ir.FloatType(), count), ir.VectorType(ir.IntType(32), count)(None)
+
+    def sums(typing: Any, x: Any, w: Any, b: Any, j: Any, out: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+            x, w, b, out = (
+                context.make_array(signature.args[i])(context, builder, given[i]) for i in (0, 1, 2, 4)
+            )
+            inputs, width = (builder.extract_value(w.shape, axis) for axis in (0, 1))
+
+            def at(array: Any, place: Any) -> Any:
+                return builder.bitcast(builder.gep(array.data, [place]), vector.as_pointer())
+
+            total = build.alloca_once_value(builder, builder.load(at(b, given[3]), align=4))
+            with build.for_range(builder, inputs) as loop:
+                value = builder.load(builder.gep(x.data, [loop.index]))
+                one = builder.insert_element(vector(ir.Undefined), value, ir.IntType(32)(0))
+                row = builder.add(builder.mul(loop.index, width), given[3])
+                products = builder.fmul(
+                    builder.shuffle_vector(one, one, first), builder.load(at(w, row), align=4)
+                )
+                builder.store(builder.fadd(builder.load(total), products), total)
+            builder.store(builder.load(total), at(out, given[3]), align=4)
+            return context.get_dummy_value()
+
+        return types.void(x, w, b, j, out), code
+
+    return intrinsic(sums)
+
+
+_many_sums, _few_sums = _sums(MANY), _sums(FEW)
 
 
 @inlined

@@ -48,6 +48,8 @@ class State(NamedTuple):
     values: Floats  # what predicates read (rule/values.py), filled for some pose
     stack: Floats  # scratch of programs
     after: Floats  # [K] scratch: predicates after a motion
+    far: Floats  # [K] the distance to each goal
+    seen: Floats  # [5] for which pose, goal and `always` `far` and the observation are, NaN at first
 
 
 def observation_size(rules: Rules, body: Body) -> int:
@@ -70,6 +72,8 @@ def make_state(scene: Scene, inputs: int) -> State:
         np.empty(value_count(scene.rules)),
         np.empty(STACK_SIZE),
         np.empty(count),
+        np.empty(count),
+        np.full(5, np.nan),
     )
 
 
@@ -81,10 +85,13 @@ def place(rules: Rules, x: float, y: float, theta: float, state: State) -> None:
 
 
 @inlined
-def arrive(rules: Rules, t: int, x: float, y: float, theta: float, state: State) -> None:
-    """Puts the robot at x_t and takes that into its progress."""
-    place(rules, x, y, theta, state)
+def arrive(rules: Rules, t: int, x: float, y: float, theta: float, state: State) -> bool:
+    """Puts the robot at x_t and takes that into its progress. Returns whether it moved."""
+    moved = bool(x != state.pose[0] or y != state.pose[1] or theta != state.pose[2])
+    if moved:
+        place(rules, x, y, theta, state)
     advance(rules, t, state.predicates, state.status, state.run)
+    return moved
 
 
 @leaf
@@ -105,47 +112,62 @@ def observe(scene: Scene, t: int, state: State) -> None:
     """Writes the observation of a state at step t, whose pose, progress, predicates and nexts are filled.
 
     First five entries on time and pose, then ten for each goal and two for each `always` in the formula's
-    order, then three for each motion.
+    order, then three for each motion. What a robot that stands has been told of its place stays as it is.
     """
-    rules, out = scene.rules, state.observation
+    rules, out, seen = scene.rules, state.observation, state.seen
     x, y, theta = state.pose[0], state.pose[1], state.pose[2]
-    cos, sin = math.cos(theta), math.sin(theta)
+    stays = x == seen[0] and y == seen[1] and theta == seen[2]
+    if not stays:
+        _observe_place(scene, x, y, theta, state)
     out[0] = t / scene.horizon
-    out[1], out[2] = cos, sin
-    out[3], out[4] = (x - scene.centre[0]) / scene.half[0], (y - scene.centre[1]) / scene.half[1]
     at, target = GLOBAL, current_goal(rules, state.status)
-    here, guarded = 0.0, False  # the distance to the current goal; whether an `always` holds at t + 1
-    middle = between(scene, x, y)
-    west, east = between(scene, x - PROBE, y), between(scene, x + PROBE, y)
-    south, north = between(scene, x, y - PROBE), between(scene, x, y + PROBE)
+    here, guards = 0.0, 0  # the distance to the current goal; as bits, which `always` hold at t + 1
     for k in range(rules.kind.shape[0]):
         if rules.kind[k] == ALWAYS:
-            guarded = guarded or rules.a[k] <= t + 1 <= rules.b[k]
+            guards |= (rules.a[k] <= t + 1 <= rules.b[k]) << k
             out[at] = _clip(state.predicates[k] / SAFE, -1.0, 1.0)
             out[at + 1] = 1.0 if rules.a[k] <= t <= rules.b[k] else 0.0
             at += PER_ALWAYS
             continue
         hold = rules.kind[k] == EVENTUALLY_ALWAYS
-        field = scene.distance[scene.goal[k]]
-        d = blend(field, *middle)
+        d, left = state.far[k], rules.last[k] - t
         if k == target:
             here = d
-        gx = blend(field, *west) - blend(field, *east)
-        gy = blend(field, *south) - blend(field, *north)
-        norm = max(math.hypot(gx, gy), 1e-6)
-        left = rules.last[k] - t
         out[at] = 1.0 if state.status[k] == SETTLED else 0.0
         out[at + 1] = _clip((rules.a[k] + rules.c2[k] - t) / TIME_UNIT, 0.0, 2.0)
         out[at + 2] = _clip(left / TIME_UNIT, -0.2, 2.0)
         out[at + 3] = _clip(state.predicates[k], -1.0, 1.0)
+        out[at + 8] = _clip((left * scene.stride - d) / DISTANCE_UNIT, -1.0, 1.0)  # metres to spare
+        out[at + 9] = state.run[k] / (rules.b[k] - rules.c2[k] + 1.0) if hold else 0.0
+        at += PER_GOAL
+    if not stays or target != seen[3] or guards != seen[4]:
+        _observe_motions(scene, t, state, at, target, here, guards != 0)
+        seen[0], seen[1], seen[2], seen[3], seen[4] = x, y, theta, target, guards
+
+
+@inlined
+def _observe_place(scene: Scene, x: float, y: float, theta: float, state: State) -> None:
+    """Writes the entries that the pose alone decides, and how far each goal is."""
+    out, cos, sin, at = state.observation, math.cos(theta), math.sin(theta), GLOBAL
+    out[1], out[2] = cos, sin
+    out[3], out[4] = (x - scene.centre[0]) / scene.half[0], (y - scene.centre[1]) / scene.half[1]
+    middle = between(scene, x, y)
+    west, east = between(scene, x - PROBE, y), between(scene, x + PROBE, y)
+    south, north = between(scene, x, y - PROBE), between(scene, x, y + PROBE)
+    for k in range(scene.goal.shape[0]):
+        if scene.goal[k] < 0:
+            at += PER_ALWAYS
+            continue
+        field = scene.distance[scene.goal[k]]
+        state.far[k] = d = blend(field, *middle)
+        gx = blend(field, *west) - blend(field, *east)
+        gy = blend(field, *south) - blend(field, *north)
+        norm = max(math.hypot(gx, gy), 1e-6)
         out[at + 4] = min(d / DISTANCE_UNIT, 2.0)
         out[at + 5] = d / (d + HALF_WAY)
         out[at + 6] = (gx * cos + gy * sin) / norm  # the way to the goal, seen from the robot: ahead
         out[at + 7] = (gy * cos - gx * sin) / norm  # and to the left
-        out[at + 8] = _clip((left * scene.stride - d) / DISTANCE_UNIT, -1.0, 1.0)  # metres to spare
-        out[at + 9] = state.run[k] / (rules.b[k] - rules.c2[k] + 1.0) if hold else 0.0
         at += PER_GOAL
-    _observe_motions(scene, t, state, at, target, here, guarded)
 
 
 @inlined

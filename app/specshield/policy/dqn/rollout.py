@@ -33,7 +33,7 @@ def _follow(
     after each, poses (T - t, 3). A broken obligation does not end the rollout, since others may still be
     kept. Once none is pending, a robot that can wait does.
     """
-    moved = True
+    known = False  # whether state.nexts are those from where the robot is
     for k in range(motions.shape[0]):
         if k == 0 and first >= 0:
             motion = first
@@ -42,13 +42,13 @@ def _follow(
             _stay(state, k, scene.wait, motions, poses)
             break
         else:
-            if moved:
+            if not known:
                 successors(scene.body, state.pose, state.nexts)
             observe(scene, t + k, state)
             motion = greedy(net, state.observation, layers)
             x, y, theta = state.nexts[motion, 0], state.nexts[motion, 1], state.nexts[motion, 2]
-            moved = x != state.pose[0] or y != state.pose[1] or theta != state.pose[2]
-        arrive(scene.rules, t + k + 1, x, y, theta, state)
+            known = True
+        known = not arrive(scene.rules, t + k + 1, x, y, theta, state) and known
         motions[k] = motion
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, theta
     return outcome(state.status)
