@@ -277,7 +277,7 @@ def _select(found: int, n: int, open_roots: int, width: int, share: int, band: f
     return count
 
 
-@leaf
+@inlined
 def _place(new: Poses, found: int, table: Int32s) -> int:
     """The row of `new` whose pose and progress are those of row `found`: an earlier one, or `found` itself,
     which is then put into the hash table.
@@ -300,7 +300,7 @@ def _place(new: Poses, found: int, table: Int32s) -> int:
     return found
 
 
-@leaf
+@inlined
 def _rounded(poses: Floats, i: int) -> tuple[int, int, int]:
     x, y, theta = POSE_GRAIN * poses[i, 0], POSE_GRAIN * poses[i, 1], POSE_GRAIN * poses[i, 2]
     return math.floor(x + 0.5), math.floor(y + 0.5), math.floor(theta + 0.5)
