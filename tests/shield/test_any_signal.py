@@ -17,6 +17,7 @@ from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
 from specshield.shield.signals import any_signal
+from specshield.shield.uncertainty import Uncertainty
 from tests.oracles.brute_stl import brute_robustness
 from tests.oracles.cells import MOTIONS, STATES, Cells
 
@@ -28,6 +29,7 @@ def near(where, region, a, b, t):
 
 
 A, B, C = (1, 2), (2, 2), (1, 0)
+CAUTIOUS = Config(any_signal=True, learn_map=True, uncertainty=Uncertainty())
 # keeps(cells, signals): the rule again, on the cell and the signals (those above a half) of each step.
 GAMES = {
     "a call": (
@@ -187,6 +189,7 @@ def _kept(cells, shield, start, samples, seed):
         ("G[0,9] (call > 2.5 -> F[0,3] A)", [[3.5]]),
         ("G[0,9] (call > 2.5 -> F[0,3] A) and G[0,9] (call > 7 -> B)", [[8.0]]),
         ("G[0,9] (call > 1 and call < 2 -> F[0,3] A)", [[1.5]]),
+        ("G[0,9] (call / 1000 > 3.3 -> F[0,3] A)", [[1e12]]),
         ("F[0,9] (call > 1 and A)", [[0.0]]),
         ("G[0,9] (call > 1 -> A) and G[0,9] (call < 0.5 -> B)", None),
         ("G[0,9] (call > x -> A)", None),
@@ -196,7 +199,7 @@ def _kept(cells, shield, start, samples, seed):
 def test_the_worst_values_ask_for_everything_that_can_be_asked_for(formula, worst):
     signals = CALL if "call" in formula else {}
     task = Cells(formula, None, {"A": A, "B": B}, signals).task
-    found = worst_signals(task)
+    found = worst_signals(task, task.formula)
     assert found is None if worst is None else found is not None
     if worst is not None and worst != [[0.0]]:
         assert found.tolist() == worst
@@ -207,3 +210,37 @@ def test_sessions_that_take_signals_to_stay_as_they_are_say_nothing_of_others():
     silent = make_shield(shield.proposers)
     assert any_signal(silent, cells.pose(1, 2, 0)[None]) is None
     assert decide(silent, [cells.pose(1, 2, 0)], np.zeros(5)).any_signal is None
+
+
+GUARDED = "G[0,2] (call > 0.5 -> F[0,3] A) and G[0,5] (not C and battery > 10)"
+
+
+def test_what_no_motion_changes_leaves_the_rest_guarded_against_signals_and_kept_once_it_is_broken():
+    """Against every way in which calls can come, with a battery that stays, runs low, or recovers."""
+    regions, signals = {"A": A, "C": C}, {"call": 0.0, "battery": 50.0}
+    cells = Cells(GUARDED, None, regions, signals)
+    rest = Cells("G[0,2] (call > 0.5 -> F[0,3] A) and G[0,5] not C", None, regions, CALL)
+    game = Game(rest, lambda w, s: all(not s[t][0] or near(w, A, 0, 3, t) for t in range(3)) and C not in w)
+    shield, played = make_shield([synthesise(cells.task, Settings(pitch=0.2))], CAUTIOUS), 0
+    for start in STARTS:
+        if not all(game.wins(STATES.index(start), (start[:2],), (sample,)) for sample in game.samples):
+            continue
+        assert any_signal(shield, cells.pose(*start)[None]) is False
+        for n, calls in enumerate(itertools.product((0.0, 1.0), repeat=6)):
+            battery = ([50.0] * 6, [50.0, 50.0, *[9.0] * 4], [50.0, 9.0, *[50.0] * 4])[n % 3]
+            told = {"call": np.array(calls), "battery": np.array(battery)}
+            random, poses, carry, statuses = np.random.default_rng(n), [cells.pose(*start)], None, []
+            for t in range(5):
+                now = {name: values[: t + 1] for name, values in told.items()}
+                decision = decide(shield, poses, random.normal(0, 3, 5), False, now, carry)
+                action = int(random.choice(5, p=decision.distribution))
+                moved = decision.completion_action if action == 4 else action
+                poses.append(decision.next_poses[moved])
+                carry = decision.carry
+                statuses.append(decision.spec_status)
+                assert not decision.any_signal
+            read = rest.task.samples(np.array(poses), {"call": told["call"]})
+            assert brute_robustness(rest.task.formula, {k: list(v) for k, v in read.items()}) > 0
+            assert ("violated" in statuses) is (min(battery[:5]) < 10)
+            played += 1
+    assert played > 100

@@ -59,7 +59,7 @@ def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
     """Warnings about a rule that signals may make harder to keep. silent: from how many starts the rule can
     be kept if the signals stay as they are.
     """
-    if worst_signals(shield.task) is None:
+    if worst_signals(shield.task, shield.task.formula) is None:
         return (
             "nothing can be said of signals that change: the formula compares signals with the pose, or "
             "asks for things that no values of the signals ask for together; the rule is kept if they stay "

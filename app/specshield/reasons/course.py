@@ -71,8 +71,7 @@ def _turns(predicate: Formula, known: Known) -> bool:
 
 def possible(predicate: Formula, ground: Ground) -> Bools:
     """The squares where a predicate may hold."""
-    possible: Bools = (ground.highest(predicate) > SATISFIED_ABOVE) & ground.free
-    return possible
+    return np.asarray((ground.highest(predicate) > SATISFIED_ABOVE) & ground.free)
 
 
 def _left(need: Need, past: Bools, now: int) -> Need | bool:

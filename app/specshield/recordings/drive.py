@@ -77,8 +77,7 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
         raise InputError(told, path="BAG", got=f"{times[-1]:g} s", expected=expected)
     wanted = np.arange(0.0, times[-1] + 1e-9, step_seconds)
     newest = np.searchsorted(times, wanted + 1e-9, side="right") - 1
-    poses: Floats = np.array([pose for _, pose in found])[newest]
-    return poses
+    return np.asarray(np.array([pose for _, pose in found])[newest])
 
 
 def check_drive(shield: LocalShield, poses: Floats) -> Judged:

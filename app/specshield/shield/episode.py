@@ -20,21 +20,12 @@ from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
 from specshield.robot.dynamics import Body, in_collision, simulate, successors, wrap
 from specshield.robot.oddity import oddities
-from specshield.shield import shaping
+from specshield.shield import judgement, shaping
 from specshield.shield.answer import all_on, answer_of, unmodified
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.caution.threshold import chances, left_of, next_left
 from specshield.shield.decision import Carry, Config, Decision, Explanation, Shield, make_shield
 from specshield.shield.feasibility import Prefix, Signals, futures, prefix_of
-from specshield.shield.judgement import (
-    Judged,
-    Situation,
-    as_actions,
-    as_numbers,
-    j_values_of,
-    without,
-    witnesses_of,
-)
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.doubt import recovered, tried_again
 from specshield.shield.surprise.slip import SAME_POSE, with_begun
@@ -44,7 +35,7 @@ from specshield.stl.robustness import verdict_between
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 
-Explainer = Callable[[Shield, Prefix, Judged | None, Bools], tuple[Explanation | None, ...]]
+Explainer = Callable[[Shield, Prefix, judgement.Judged | None, Bools], tuple[Explanation | None, ...]]
 
 
 def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> None:
@@ -53,11 +44,7 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
     way: one more future to try, see `Carry`. Raises PoseError for a pose that is not finite, outside the map
     or in collision, else InfeasibleStart.
     """
-    try:
-        history = _history([pose])
-    except (PoseError, ValueError):
-        got, expected = str(list(pose)), "finite [x, y, theta]"
-        raise PoseError("not a pose", path="initial_pose", got=got, expected=expected) from None
+    history = _history([pose], "initial_pose")
     check_place(shield, history[0], "initial_pose")
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     rho, warnings = np.array([prefix.low]), tuple[str, ...]()
@@ -157,7 +144,7 @@ def decide(
         judged = None
         answer = unmodified(shield, log_prior)
     else:
-        now = Situation(prefix, tail, spec_status, care)
+        now = judgement.Situation(prefix, tail, spec_status, care)
         shield, now, judged, withstands = judged_by_signals(shield, now)
         believed = tried_again(told, taught, judged, now)
         if believed is not None:
@@ -167,7 +154,7 @@ def decide(
         prefix = now.prefix
         doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
         judged = recovered(told, shield, taught, judged, now)
-        judged = without(judged, shield, doubts, risky)
+        judged = judgement.without(judged, shield, doubts, risky)
         if judged.vain and judged.some:
             said = (*said, "every way left has a motion that led nowhere from here before: it is tried again")
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
@@ -182,7 +169,7 @@ def decide(
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
-    certified, unknown, mass = witnesses_of(shield, judged), (None,) * len(robot.actions), None
+    certified, unknown, mass = judgement.witnesses_of(shield, judged), (None,) * len(robot.actions), None
     if judged is not None and answer.conditional is not None:
         mass = shaping.feasible_mass(answer.conditional, judged.feasible)
     if chance is not None:
@@ -199,8 +186,8 @@ def decide(
         t=t,
         mode=answer.mode,
         distribution=answer.distribution,
-        j_values=unknown if judged is None else j_values_of(shield, judged),
-        robustness=unknown if judged is None else as_numbers(judged.robustness.tolist()),
+        j_values=unknown if judged is None else judgement.j_values_of(shield, judged),
+        robustness=unknown if judged is None else judgement.as_numbers(judged.robustness.tolist()),
         action=action,
         action_name=robot.actions[action].name,
         completion_action=None if judged is None else judged.completion,
@@ -212,8 +199,8 @@ def decide(
         next_poses=places.take(robot.motion_of, 0),
         residual=residual,
         in_collision=touches,
-        witness=as_actions(shield, certified, moved),
-        witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
+        witness=judgement.as_actions(shield, certified, moved),
+        witnesses=tuple(judgement.as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
         else (),
         warnings=said if judged is None else (*said, *judged.tried.warnings),
@@ -240,12 +227,12 @@ def decide(
     )
 
 
-def _history(poses: ArrayLike) -> Floats:
+def _history(poses: ArrayLike, path: str = "poses") -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64, order="C")
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not _wrapped(array):
         expected = "a list of finite [x, y, theta]"
-        raise PoseError("not poses", path="poses", got=str(poses)[:80], expected=expected)
+        raise PoseError("not poses", path=path, got=str(poses)[:80], expected=expected)
     return array
 
 

@@ -18,7 +18,6 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Futures, Prefix, simulated
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
-from specshield.task import Task
 
 # Chosen by hand, so that one search costs some milliseconds; tests/shield/test_escape.py says what is found.
 POSES_A_LAYER = 1024  # poses that are simulated at each step of the search, about
@@ -38,11 +37,6 @@ class Layer(NamedTuple):
     root: Ints
     motion: Ints
     parent: Ints
-
-
-def is_place(task: Task, formula: Always) -> bool:
-    """Whether the robot's pose alone decides at each step if a G is kept, as in "never enter a place"."""
-    return formula.child.horizon == 0 and any(name not in task.signals for name in formula.child.names)
 
 
 def escape(

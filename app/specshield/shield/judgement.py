@@ -15,13 +15,14 @@ from specshield.compiled import kernel
 from specshield.robot.barred import in_vain
 from specshield.robot.room import has_room, widened
 from specshield.rule.residual import again, all_of, left_over
+from specshield.rule.worst import alone
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
-from specshield.shield.escape import escape, holding, is_place
+from specshield.shield.escape import escape
 from specshield.shield.feasibility import Futures, Prefix, best_of, futures, rho_of, simulated, together
 from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
-from specshield.shield.uncertainty import Care
+from specshield.shield.uncertainty import EXACT, Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
@@ -100,7 +101,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         best = best_of(tried.motions, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
-    if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy is slow for so few
+    if lowered or ((care.least or care.noise is not EXACT) and max(values.tolist()) > SATISFIED_ABOVE):
         aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
         most = aimed.slack or max(aimed.early.tolist(), default=0)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
@@ -228,24 +229,15 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
 
     1. all other conjuncts, and each broken G from the first step on that can be kept, the next one at most;
     2. the same, each broken G from the earliest step at which the robot can be out of the forbidden place;
-    3. the same without broken G over signals, which no motion of the robot mends;
+    3. the same without broken G that look ahead;
     4. the conjuncts of the form G, and the broken G, at the price of what was to be reached;
     5. all other conjuncts, without the broken G.
-
-    A broken G over signals alone that does not hold now is given up at once.
     """
     task, t = shield.task, prefix.t
-    kept, lost = left_over(task.formula, task.samples(prefix.poses, prefix.signals), t)
-    broken = [
-        each
-        for each in map(flat, lost)
-        if is_place(task, each)
-        or each.child.horizon > 0
-        or holding(prefix, [each], prefix.poses[-1:], t)[0] > SATISFIED_ABOVE
-    ]
-    places = [each for each in broken if is_place(task, each)]
-    guards = [flat(each) for each in kept if isinstance(each, Always)]
-    guards = [each for each in guards if is_place(task, each)]
+    kept, lost = left_over(prefix.formula, task.samples(prefix.poses, prefix.signals), t)
+    broken = [flat(each) for each in lost]
+    places = [each for each in broken if each.child.horizon == 0 and not alone(task, each)]
+    guards = [flat(each) for each in kept if isinstance(each, Always) and flat(each).child.horizon == 0]
 
     def keeps(parts: list[Formula]) -> bool:
         return bool(rho_of(prefix.of(all_of(parts)), tried.poses)[0].max() > SATISFIED_ABOVE)
@@ -261,10 +253,8 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
             if ways is not None:
                 tried = together(tried, ways)
             if steps > 0:
-                others = [each for each in broken if each not in places]
                 yield [*kept, *again(broken, t + steps)]
-                if others:
-                    yield [*kept, *again(places, t + steps)]
+                yield [*kept, *again(places, t + steps)]
                 yield [*guards, *again(places, t + steps)]
         yield kept
 

@@ -15,7 +15,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from specshield.arrays import Floats, Ints
-from specshield.compiled import kernel
 from specshield.task import Task
 
 MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
@@ -113,20 +112,10 @@ def _checked(given: object, count: int, steps: int, least: int) -> Proposal | st
         rows = f"N from {least} to {MAX_MOTIONS // steps}"
         return f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], {rows}"
     own = np.array(motions, np.int64, order="C")
-    wrong = _first_outside(own, count)
-    if wrong is not None:
-        return f"it names motion {wrong}; the robot has motions 0 to {count - 1}"
+    wrong = own[(own < 0) | (own >= count)]
+    if len(wrong):
+        return f"it names motion {wrong[0]}; the robot has motions 0 to {count - 1}"
     whole = isinstance(preferred, (int, np.integer)) and not isinstance(preferred, bool)
     if not (whole and 0 <= preferred < count):
         return f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}"
     return Proposal(own, int(preferred))
-
-
-@kernel
-def _first_outside(motions: Ints, count: int) -> int | None:
-    """The first of motions [N, T - t] that is not from 0 to `count` - 1, None where all are."""
-    for row in range(motions.shape[0]):
-        for k in range(motions.shape[1]):
-            if not 0 <= motions[row, k] < count:
-                return int(motions[row, k])
-    return None

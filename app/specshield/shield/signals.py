@@ -1,10 +1,12 @@
 """What is feasible whatever the signals do.
 
-J takes signals to keep their last value, as the paper does. Here the signals are taken to be at their worst
-from x_{t+1} on (rule/worst.py). An action that is feasible under the worst signals has a witness that keeps
-the rule under any signals. What is left of that witness after the next step keeps the rule too, whatever the
-signals were at that step. So once some action is feasible in this sense, some action is so at every later
-step of the episode.
+J takes signals to keep their last value, as the paper does. Here they are taken to be at their worst from
+x_{t+1} on (rule/worst.py). An action that is feasible then has a witness that keeps the rule under any
+signals. What is left of it after the next step keeps the rule too, whatever the signals were at that step. So
+once some action is feasible in this sense, some action is so at every later step of the episode.
+
+No motion changes what a rule asks of signals alone, such as `G battery > 10`. So motions are judged by the
+rest of the rule, as long as that part is kept if the signals stay as they are, and also once it is broken.
 """
 
 from __future__ import annotations
@@ -15,24 +17,39 @@ from dataclasses import replace
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.rule.worst import worst_signals
+from specshield.rule.worst import moved, worst_signals
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import prefix_of
+from specshield.shield.feasibility import prefix_of, rho_of
 from specshield.shield.judgement import Judged, Situation, judge
 from specshield.shield.proposal import adapted
+from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE
+from specshield.stl.robustness import verdict_between
 
 
 def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged, bool]:
     """Judges the actions with the signals at their worst or, if none is feasible then, at their last values.
-    Returns the shield and the situation, what was judged of them, and whether the signals were at worst.
+    Returns the shield and the situation, what was judged of them, and whether the whole rule is kept whatever
+    the signals do.
     """
-    if shield.config.any_signal and now.status == "pending":
-        found = _judged_at_worst(shield, now)
-        if found is not None:
-            return *found, True
-    return shield, now, judge(shield, now), False
+    whole, (rest, fixed) = now.prefix, moved(shield.task)
+    least, sure, broken = np.inf, True, False
+    if fixed is not None:
+        part, other = whole.of(rest), whole.of(fixed)
+        standing = np.broadcast_to(whole.poses[-1], (1, whole.steps, 3))
+        held, broken = rho_of(other, standing)[0].item(), other.high <= SATISFIED_ABOVE
+        if broken or held > SATISFIED_ABOVE:
+            now = now._replace(prefix=part, status=verdict_between(part.low, part.high))
+            least, sure = held, other.low > SATISFIED_ABOVE
+    found = _judged_at_worst(shield, now)
+    shield, now, judged = found or (shield, now, judge(shield, now))
+    if broken and recovers(shield.config):
+        said = (*judged.tried.warnings, *given_up(other))
+        judged = judged._replace(tried=judged.tried._replace(warnings=said))
+    values = judged.values if broken else np.minimum(judged.values, least)
+    judged = judged._replace(values=values, robustness=np.minimum(judged.robustness, least))
+    return shield, now, judged, found is not None and sure
 
 
 def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | None = None) -> bool | None:
@@ -44,7 +61,7 @@ def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | No
     task = shield.task
     if not shield.config.any_signal or not task.signals:
         return None
-    worst = worst_signals(task)
+    worst = worst_signals(task, task.formula)
     if worst is None:
         return False
     seen = {
@@ -52,14 +69,16 @@ def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | No
         for name, value in zip(task.signals, worst[0], strict=True)
     }
     prefix = prefix_of(task, task.formula, shield.view, poses, seen)
-    if prefix.low > SATISFIED_ABOVE or prefix.high <= SATISFIED_ABOVE or prefix.steps <= 0:
-        return prefix.low > SATISFIED_ABOVE
-    return _judged_at_worst(shield, Situation(prefix, None, "pending", Care(0.0, 0))) is not None
+    now = Situation(prefix, None, verdict_between(prefix.low, prefix.high), Care(0.0, 0))
+    return now.status == "satisfied" or (prefix.steps > 0 and _judged_at_worst(shield, now) is not None)
 
 
 def _judged_at_worst(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged] | None:
-    """As `judged_by_signals`, with the signals at worst alone; None if no action is feasible then."""
-    held = worst_signals(shield.task)
+    """As `judged_by_signals`, by the formula of the situation's prefix and with the signals at worst alone.
+    None if no action is feasible then, or the session does not ask that, or the formula is decided.
+    """
+    asked = shield.config.any_signal and now.status == "pending"
+    held = worst_signals(shield.task, now.prefix.formula) if asked else None
     if held is None:
         return None
     proposers = tuple(adapted(p, "foreseeing", held[0]) for p in shield.proposers)

@@ -89,10 +89,6 @@ class Care(NamedTuple):
     room: bool = False
     guess: bool = False
 
-    @property
-    def has_slack(self) -> bool:
-        return self.least > 0 or self.noise is not EXACT
-
 
 def margin_for(noise: Noise, stride: float, steps: int) -> float:
     """The margin [m] that is exceeded by none of `steps` motions, with a probability of 1 - CHANCE / 2.

@@ -82,5 +82,4 @@ class GoalSeeker:
 
 def softmax(logits: Floats) -> Floats:
     weights = np.exp(logits - logits.max())
-    probabilities: Floats = weights / weights.sum()
-    return probabilities
+    return np.asarray(weights / weights.sum())

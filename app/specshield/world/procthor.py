@@ -181,8 +181,7 @@ def _rotation(degrees: tuple[float, float, float]) -> Floats:
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    rotation: Floats = about_y @ about_x @ about_z
-    return rotation
+    return np.asarray(about_y @ about_x @ about_z)
 
 
 class _Canvas(NamedTuple):

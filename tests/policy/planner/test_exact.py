@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks import deadlines
-from specshield.policy.planner.policy import synthesise
+from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, simulate
 from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.cells import STATES, WALLS, Cells
 from tests.policy.rooms import OCCUPIED, REGIONS, flat
 
 ROOM = OccupancyGrid(np.pad(np.zeros((48, 48), bool), 1, constant_values=True), 0.1)
@@ -67,3 +68,21 @@ def test_a_choice_of_places_is_searched_for_as_one_place_is(rule):
         simulate(body, start, motions, led)
     driven = [task.samples(np.concatenate([start[None], led])) for led in poses]
     assert any(robustness(task.formula, each) > 0.0 for each in driven)
+
+
+@pytest.mark.parametrize(("first", "later"), [(1.0, 0.0), (0.0, 1.0)])
+def test_what_a_signal_forbids_when_a_policy_is_made_bars_no_way_once_it_allows_it(first, later):
+    """Against every future of a small world, from each start; the first sample is not the declared value."""
+    rule, cells = "F[0,6] A and G[0,6] (person > 0.5 -> not B)", {"A": (1, 2), "B": (2, 2)}
+    world = Cells(
+        rule, lambda s: s["A"].any(-1) & ~(s["B"].any(-1) & (later > 0.5)), cells, {"person": first}
+    )
+    shield, some = make_shield([synthesise(world.task, Settings(pitch=0.2))]), 0
+    for state in STATES:
+        pose = world.pose(*state)
+        if WALLS[state[1]][state[0]] == "." and not (later and state[:2] == cells["B"]):
+            decision = decide(shield, [pose], np.zeros(5), signals={"person": np.array([later])})
+            expected = world.feasible([pose])
+            assert [j == 1.0 for j in decision.j_values[:4]] == expected.tolist()
+            some += expected.any()
+    assert some > 20

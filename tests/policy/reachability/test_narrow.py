@@ -88,3 +88,17 @@ def test_such_a_policy_comes_back_from_its_files():
 @pytest.mark.parametrize("name", ["case1", "case2"])
 def test_the_lattice_sees_the_rules_of_the_cases(name):
     assert not synthesise(load_case(name).task).narrow.any()
+
+
+def test_a_signal_near_its_bound_is_no_narrow_place():
+    """The policy finds as much as for the rule without it: no motion leads nearer to what a signal is."""
+    base = load_case("case2")
+    without, told = (
+        synthesise(
+            make_task(base.task.grid, STRETCH, f"F[0,60] Region1{more}", base.spec["regions"], signals=s)
+        )
+        for more, s in (("", {}), (" and G[0,60] charge > 0.1", {"charge": 0.115}))
+    )
+    assert not told.narrow.any()
+    shares = [policy.card["metrics"]["feasible_start"] for policy in (without, told)]
+    assert shares[0] == shares[1] > 0.5

@@ -16,6 +16,7 @@ import numpy as np
 from specshield.arrays import Ints
 from specshield.rule.residual import all_of
 from specshield.rule.view import View, view_of
+from specshield.rule.worst import alone
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until, conjuncts
 from specshield.stl.conjunction import is_predicate, signed
 from specshield.task import Task, kept_with_task
@@ -69,7 +70,7 @@ def literals_of(task: Task, formula: Formula) -> tuple[PackedLiterals, tuple[Lit
     examples: list[tuple[int, int]] = []
     for n, (found, positive, ends) in enumerate(_leaves(formula, True, None)):
         base, sign = _without_not(found)
-        if _reads_signals_alone(task, base):
+        if alone(task, base):
             leaves.append((-1, sign))
             continue
         if base not in predicates:
@@ -96,14 +97,14 @@ def separate(task: Task, formula: Formula) -> Formula:
     """The same formula, of the same robustness, in which no leaf joins signals to the pose by `and`, `or` or
     `implies`. A part that reads signals alone is put under G[0,0], which makes it a leaf of its own.
     """
-    joins = isinstance(formula, And | Or | Implies) and not _reads_signals_alone(task, formula)
+    joins = isinstance(formula, And | Or | Implies) and not alone(task, formula)
 
     def apart(part: object) -> object:
         if isinstance(part, tuple):
             return tuple(map(apart, part))
         if not isinstance(part, Formula):
             return part
-        if joins and _reads_signals_alone(task, part):
+        if joins and alone(task, part):
             return part if part.horizon else Always(0, 0, part)
         return separate(task, part)
 
@@ -129,10 +130,6 @@ def leading(literal: Literal) -> tuple[Formula, int]:
     """The predicate and side of a literal's first part, to which a field may lead if none leads to all."""
     whole = literal.predicate
     return _without_not(whole.children[0] if isinstance(whole, And) else whole)
-
-
-def _reads_signals_alone(task: Task, formula: Formula) -> bool:
-    return set(formula.names) <= set(task.signals)
 
 
 def _without_not(predicate: Node) -> tuple[Formula, int]:

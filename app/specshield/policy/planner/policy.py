@@ -28,7 +28,7 @@ from specshield.policy.extent import COARSEST, fitting_pitch
 from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
+from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
 from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
@@ -44,12 +44,12 @@ from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
 from specshield.rule.residual import all_of
-from specshield.rule.values import REGIONS, places, regions_of, signal_rows
+from specshield.rule.values import places, regions_of, signal_rows
 from specshield.rule.view import look
-from specshield.rule.worst import worst_signals
+from specshield.rule.worst import moved, worst_signals
 from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
-from specshield.stl.program import STACK_SIZE, compile_predicates
+from specshield.stl.program import compile_predicates
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
 from specshield.task import Task
 
@@ -99,7 +99,8 @@ class PlannerPolicy(Carded):
 
     def giving_up(self, lost: tuple[Formula, ...]) -> PlannerPolicy:
         """The policy for its rule without these parts: it proposes one way alone, with less effort."""
-        rest = [part for part in conjuncts(self.task.formula) if part not in lost]
+        parts = conjuncts(moved(self.task)[0])
+        rest = [part for part in parts if part not in lost] or parts
         return replace(self, share=GUESSED, rest=all_of(rest))._in(self._world)
 
     def foreseeing(self, signals: Floats) -> PlannerPolicy:
@@ -145,7 +146,7 @@ class PlannerPolicy(Carded):
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         formula = self._world.literals.formula
         _, high = look(formula, history, rows, np.empty(formula.tree.size))
-        whole = self.rest or self.task.formula
+        whole = self.rest or moved(self.task)[0]
         parts: Iterable[Formula] = (whole,)
         if high <= SATISFIED_ABOVE:
             left = residuals(whole, self.task.samples(history, signals), t)
@@ -256,7 +257,7 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
     )
     metrics = {"feasible_start": round(share, 4)}
     if task.signals:
-        worst = worst_signals(task)
+        worst = worst_signals(task, task.formula)
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
         share = policy.feasible_start(lattice, at_worst) if at_worst else 0.0
         metrics["feasible_start_any_signal"] = round(share, 4)
@@ -316,12 +317,12 @@ def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> 
     """The literals that every way to a goal keeps; and these with those that may have to hold for a while.
     The former have to hold, whatever else happens, at half of all steps or more.
     """
-    size = packed.formula.tree.size
-    bounds = make_bounds(size)
-    values = np.concatenate([np.zeros(REGIONS + len(task.areas)), initial_signals(task)])
-    held = np.empty(len(packed.leaf))
-    read_signals(packed, values, np.empty(STACK_SIZE), held)
-    foresee(packed, -1, np.empty(size), held, bounds)
+    tree = packed.formula.tree
+    bounds = make_bounds(tree.size)
+    foresee(packed, -1, np.empty(tree.size), np.zeros(len(packed.leaf)), bounds)
+    for n in np.flatnonzero(packed.leaf[:, 0] < 0):  # the signals may be anything
+        span = slice(tree.leaf_at[n], tree.leaf_at[n] + tree.leaf_stop[n] - tree.leaf_start[n])
+        bounds.low[span], bounds.high[span] = -np.inf, np.inf
     always = []
     for k in range(len(literals)):
         needed = [not is_open_if(packed, k, -1, -1, t, t, bounds) for t in range(task.horizon + 1)]

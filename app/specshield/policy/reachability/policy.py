@@ -41,6 +41,7 @@ from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.robot.room import widened
 from specshield.rule.values import signal_rows
 from specshield.rule.view import view_of
+from specshield.rule.worst import apart, moved
 from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
@@ -97,7 +98,9 @@ class ReachabilityPolicy(Carded):
     def giving_up(self, lost: tuple[Formula, ...]) -> ReachabilityPolicy:
         """`briefly`, and as if the windows of these parts of the rule were over before it began."""
         other, rules = self._but(self._body, brief=True, guess=False), self._rules
-        gone = [part in lost for part in conjuncts(self.task.formula) for _ in obligations(part)]
+        left = {each for part in conjuncts(moved(self.task)[0]) if part not in lost for each in apart(part)}
+        parts = conjuncts(self.task.formula)
+        gone = [left.isdisjoint(apart(part)) for part in parts for _ in obligations(part)]
         a, b, c1, c2, last = np.where(gone, [[0], *[[-1]] * 4], rules[1:6])
         other.__dict__["_rules"] = rules._replace(a=a, b=b, c1=c1, c2=c2, last=last)
         return other
@@ -154,7 +157,8 @@ class ReachabilityPolicy(Carded):
     ) -> Proposal:
         """effort: of the search for narrow predicates."""
         rules = self._rules._replace(signals=self._rules.signals.copy(), margin=margin)
-        rows = signal_rows(self.task, signals, len(history))
+        read = moved(self.task)[0].names  # what the rule asks of other signals, no motion changes
+        rows = signal_rows(self.task, {name: signals[name] for name in read if name in signals}, len(history))
         shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
         chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
         proposals = []

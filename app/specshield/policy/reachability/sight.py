@@ -32,12 +32,13 @@ def look_closely(body: Body, rules: Rules, lattice: Lattice, holds: Bytes) -> tu
     predicate [K].
 
     holds [K, ny, nx, H]: of `holds_at`. An `always` counts as narrow only if it holds well inside nowhere: a
-    gap beside a forbidden place is not a place to lead a robot to.
+    gap beside a forbidden place is not a place to lead a robot to. A predicate that reads signals alone is
+    never narrow: no motion leads nearer to it.
     """
     narrow = np.zeros(len(rules.kind), np.bool_)
     for k in range(len(rules.kind)):
         outer, inner = _views(body, rules, lattice, k)
-        if rules.kind[k] == ALWAYS and inner.any():
+        if not any(reads(rules, k)) or (rules.kind[k] == ALWAYS and inner.any()):
             continue
         missed = outer & ~about(inner) & (lattice.valid == 1)
         if missed.any():

@@ -156,8 +156,7 @@ def _direction(body: Body, pose: Floats, motion: int) -> float:
 def cells_under(body: Body, pose: Floats, deep: float) -> Ints:
     """The cells, ascending, that the footprint at a pose (3,) covers by more than `deep` [m]."""
     cells, gap, _ = _around(body, pose, 0.0)
-    under: Ints = cells[gap < -deep]
-    return under
+    return np.asarray(cells[gap < -deep])
 
 
 def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floats]:
