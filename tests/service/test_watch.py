@@ -15,6 +15,7 @@ import psutil
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from specshield import __version__
 from tests.serving import RunningServer, children, command_line, serving, wait_for
 
 START, LOGITS = [4.5, 5.0, 0.0], [0.0] * 20
@@ -83,7 +84,7 @@ def test_what_several_processes_count_is_true_and_outlives_each_of_them(tmp_path
             route = ("POST", "/v1/sessions/{session_id}/steps")
             assert found[("specshield_requests_total", *route, "200")] == 3 * n
             assert found[("specshield_request_seconds_count", *route)] == 4 * n
-            assert (found["specshield_store_up",], found["specshield_build_info", "0.1.0"]) == (1, 1)
+            assert (found["specshield_store_up",], found["specshield_build_info", __version__]) == (1, 1)
             assert found["specshield_store_bytes",] > 0
             assert found["specshield_jobs", "dqn", "queued"] == 0
 
