@@ -6,7 +6,8 @@ A Stretch drives to a place of its own in the maps of cases 1 and 2, from anywhe
 continuation leads it. Each motion ends off by sigma 1 cm along x and along y and by sigma half a degree, or
 closer where that would be inside an obstacle. Nothing is asked beyond the rule. Printed: how often the robot
 comes more than k steps later than the first continuation would have; and what V of a threshold over the
-episode expects (shield/caution/threshold.py) of robots that meet no obstacle and miss no place.
+episode expects (shield/caution/threshold.py): a normal deviate, rounded to whole steps, and now and then a
+longer delay.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, in_collision, make_body, successors, wrap
 from specshield.shield.caution.threshold import FOR, HELD_UP
 from specshield.shield.episode import Config, Shield, decide, make_shield, start
-from specshield.shield.uncertainty import Noise, spread_of
+from specshield.shield.uncertainty import Noise, above, spread_of
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -55,8 +56,9 @@ def main() -> None:
 
 
 def later(spread: float, left: int, k: int) -> float:
-    """The probability that the robot comes more than k steps late, `left` motions away."""
-    return 1.0 - math.exp(-HELD_UP * spread * left * math.exp(-k / FOR))
+    """The probability that the robot comes more than k steps late, `left` steps away."""
+    held_up = HELD_UP * spread * left * math.exp(-k / FOR)
+    return 1.0 - (1.0 - above(k + 0.5, spread * math.sqrt(left))) * math.exp(-held_up)
 
 
 def drive(grid: OccupancyGrid, runs: int, random: np.random.Generator) -> tuple[Floats, Floats]:

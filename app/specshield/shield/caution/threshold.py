@@ -20,8 +20,6 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.portable import inner
-from specshield.robot.body import centre
-from specshield.robot.dynamics import Body, free_distance
 from specshield.rule.early import Conjuncts, conjunction_of, find_open
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Prefix, rho_of
@@ -30,14 +28,11 @@ from specshield.shield.uncertainty import Care, Noise, above, spread_of
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY, tree_value
 
-Risks = tuple[Noise, float, float, float]  # noise, its `spread_of`, sigma of a motion [m], margin [m]
-Ways = tuple[Floats, Floats, Ints, Floats]  # leaves, rho, motions and poses of the `Futures`
 GRID = 100  # V is rounded down to a multiple of 1 / GRID, so that actions which are nearly as good are equal
 
-# By hand, beside `python -m benchmarks.lateness`: how often noise holds up a motion, for each step of
-# `spread_of` [1 / step]; for how long in the mean [steps]; after how many motions it leads no farther astray.
-HELD_UP, FOR, STEERED = 0.06, 3.0, 5
-SHARP = 1.5  # [rad] with no turn below this, a robot cannot steer clear of what it met
+# Longer delays, chosen by hand beside what `python -m benchmarks.lateness` prints: how often a motion has
+# one, for each step of `spread_of` [1 / step], and how long it lasts in the mean [steps].
+HELD_UP, FOR = 0.04, 5.0
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # more slips of one future, or less probable ones, are not counted. By hand.
 
 
@@ -45,61 +40,73 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     """V of each action [A]; 0 for a terminal one. doubts [M]: motions that get V = 0 if they are not
     feasible while others are, though some future of theirs may keep the rule.
     """
-    tried, task, (margin, _, noise, stride) = judged.tried, shield.task, care[:4]
+    tried, task = judged.tried, shield.task
     view, parts = conjunction_of(task, prefix.formula)
     leaves = tried.leaves
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # futures set aside do not count
-    size, values = len(parts.kind), np.zeros(len(task.robot.motions))
-    still, any_visit = np.empty(size, np.bool_), np.full(size, SATISFIED_ABOVE)
-    find_open(parts, prefix.known, prefix.t, any_visit, still, np.empty(size))
-    ways, sigma = (leaves, rho, tried.motions, tried.poses), math.hypot(noise.move, stride * noise.turn)
-    risks = noise, spread_of(noise, stride), sigma, margin
-    _chances(parts, still, prefix.t, shield.body, risks, ways, task.robot.wait_motion, values)
+    still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
+    any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
+    find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
+    motions, wait = tried.motions, task.robot.wait_motion
+    _chances(parts, still, prefix.t, care.noise, care.stride, care.margin, leaves, rho, motions, wait, values)
+    motion_of = task.robot.motion_of
     if judged.some:
         values[doubts & ~judged.feasible_motion] = 0.0
-    return np.where(task.robot.motion_of >= 0, np.floor(GRID * values)[task.robot.motion_of] / GRID, 0.0)
+    return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
 
 
 @kernel
 def _chances(
-    parts: Conjuncts, still: Bools, t: int, body: Body, risks: Risks, ways: Ways, wait: int, values: Floats
+    parts: Conjuncts,
+    still: Bools,
+    t: int,
+    noise: Noise,
+    stride: float,
+    margin: float,
+    leaves: Floats,
+    rho: Floats,
+    motions: Ints,
+    wait: int,
+    values: Floats,
 ) -> None:
     """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open."""
-    count, (noise, spread, sigma, margin), (leaves, rho, motions, poses) = still.shape[0], risks, ways
-    buffer, due = np.empty(leaves.shape[1]), np.empty((count, 3))
-    late = np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
+    count, spread = still.shape[0], spread_of(noise, stride)
+    sigma = math.hypot(noise.move, stride * noise.turn)
+    buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
+    due = np.empty((count, 3), np.int64)
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
             continue
         copy_row(leaves[f], buffer)
         tree_value(parts.below, buffer)
-        chance, dwells, last = 1.0, 0, 0
+        chance, dwells = 1.0, 0
         for k in range(count):
-            due[k, 0] = 0.0
+            due[k, 0] = 0
             if not still[k]:
                 continue
-            at, due[k, 1], due[k, 2] = _deadline(parts, k, t, margin, buffer)
-            due[k, 0], last = at, max(last, at)
+            due[k, 0], due[k, 1], due[k, 2] = _deadline(parts, k, t, margin, buffer)
             if parts.kind[k] == EVENTUALLY and parts.horizon[k] > 0:
-                dwells = max(dwells, at)
+                dwells = max(dwells, due[k, 0])
             if not parts.plain[k] and (noise.slips > 0.0 or spread > 0.0):
                 chance = 0.0
             if sigma > 0.0 and parts.kind[k] == ALWAYS:
                 for step in range(max(parts.a[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
-                    apart = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
-                    chance *= 1.0 - math.exp(-0.5 * (apart / sigma) ** 2)
+                    deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
+                    chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
         if chance > 0.0 and (noise.slips > 0.0 or spread > 0.0):
-            chance *= _in_time(body, risks, due, motions[f, :last], poses[f], wait, dwells, late)
+            never = _in_time(noise, spread, False, due, motions[f], wait, dwells, late)
+            slips = _in_time(noise, spread, True, due, motions[f], wait, dwells, late)
+            chance *= (1.0 - noise.slips) * never + noise.slips * slips
         values[motions[f, 0]] = max(values[motions[f, 0]], chance)
 
 
 @leaf
-def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -> tuple[int, int, float]:
+def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -> tuple[int, int, int]:
     """The deadline of conjunct k along a future: after how many motions the robot is where it has to be, 0
-    for no deadline; how many steps later it may be there; and how deep in the place of an F it is [m].
+    for no deadline; how many steps later it may be there; and in how many steps from t the deadline is.
 
     An F counts from the first step that meets it by `margin`, or meets it at all if none does. A G that has
     begun has no deadline. buffer (size,): the values of the leaves along the future.
@@ -112,46 +119,44 @@ def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -
                 break
             if met < 0 and buffer[first + step] > SATISFIED_ABOVE:
                 met = step
-        return met + parts.horizon[k] - t, b - met, buffer[first + met]
+        last = parts.horizon[k] - t
+        return met + last, b - met, b + last
     if a <= t:
-        return 0, 0, np.inf
+        return 0, 0, 0
     met = a
     while met > (t if parts.lead[k] > 0 else a) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
         met -= 1
-    return met - t, a - met, np.inf
+    return met - t, a - met, a - t
 
 
 @leaf
 def _in_time(
-    body: Body, risks: Risks, due: Floats, motions: Ints, poses: Floats, wait: int, dwells: int, late: Floats
+    noise: Noise, spread: float, slips: bool, due: Ints, motions: Ints, wait: int, dwells: int, late: Floats
 ) -> float:
-    """The probability that a robot which follows motions (n,) to the last deadline meets all deadlines. It
-    repeats a motion that was not executed and, if it is late, leaves out waits, but not among the first
-    `dwells`. Noise holds it up now and then, and where a move meets an obstacle or a place is missed: each as
-    likely as that noise leads farther than the clearance, or the depth. What cannot steer clear stays there.
+    """The probability that a robot which follows a future's motions (T - t,) meets all deadlines. It repeats
+    a motion that was not executed and, if it is late, leaves out waits, but not among the first `dwells`.
 
-    due (K, 3): of `_deadline`. poses (n, 3): where motions lead. late (MOST_SLIPS + 1, MOST_SLIPS + 2):
+    slips: whether motions slip. due (K, 3): results of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2):
     scratch; late[s, k] is the probability that s motions slipped and the robot is k steps late, but was in
     time for all that was due before. More slips than MOST_SLIPS, and those less likely than UNLIKELY, count
-    as too late.
+    as too late. What noise costs is rounded to whole steps.
     """
-    noise, spread, sigma, _ = risks
-    moved, top, met, never, steers = 0, 0, 0.0, 1.0, False  # top: the most slips that are likely
-    for turn in body.rotate:
-        steers |= 0.0 < abs(turn) < SHARP
+    last, made, top = 0, 0, 0  # top: the most slips that are likely
+    for c in range(due.shape[0]):
+        last = max(last, due[c, 0])
     late[0, :] = 0.0
     late[0, 0] = 1.0
-    for n in range(motions.shape[0]):
-        if motions[n] == wait:
-            if n >= dwells:
+    for n in range(1, last + 1):
+        if motions[n - 1] == wait:
+            if n > dwells:
                 for s in range(top + 1):
                     late[s, 0] += late[s, 1]
                     for k in range(1, s + 1):
                         late[s, k] = late[s, k + 1]
-        else:
+        elif slips:
             s = 0
             while s <= top:
-                share, most = (noise.lost + s) / (noise.lost + noise.kept + s + moved), 0.0
+                share, most = (noise.lost + s) / (noise.lost + noise.kept + s + made), 0.0
                 if s == top and top < MOST_SLIPS:
                     late[s + 1, :] = 0.0
                 for k in range(s + 1):
@@ -160,27 +165,22 @@ def _in_time(
                     if s < MOST_SLIPS:
                         late[s + 1, k + 1] += again
                     most = max(most, again)
-                if s == top and top < MOST_SLIPS and most > UNLIKELY and noise.slips > 0.0:
+                if s == top and top < MOST_SLIPS and most > UNLIKELY:
                     top += 1
                 s += 1
-            moved += 1
-        off, move = sigma * math.sqrt(min(moved, STEERED)), body.translate[motions[n]]
-        if move != 0.0 and off > 0.0:
-            u, v = centre(body, poses[n, 0], poses[n, 1], poses[n, 2])
-            met += above(free_distance(body, u, v, body.radius + 4.0 * off) - body.radius, off)
+            made += 1
         for c in range(due.shape[0]):
-            if due[c, 0] == n + 1:
-                held = HELD_UP * spread * moved + above(due[c, 2], off) + (met if steers else 0.0)
-                never *= math.exp(-held * math.exp(-due[c, 1] / FOR))
+            if due[c, 0] == n:
                 for s in range(top + 1):
                     for k in range(s + 1):
-                        spare = due[c, 1] - k
-                        late[s, k] *= math.exp(-held * math.exp(-spare / FOR)) if spare >= 0 else 0.0
+                        spare, left = due[c, 1] - k, due[c, 2]
+                        longer = HELD_UP * spread * left * math.exp(-spare / FOR)
+                        late[s, k] *= (1.0 - above(spare + 0.5, spread * math.sqrt(left))) * math.exp(-longer)
     sure = 0.0
     for s in range(top + 1):
         for k in range(s + 1):
             sure += late[s, k]
-    return ((1.0 - noise.slips) * never + noise.slips * sure) * (1.0 if steers else math.exp(-met))
+    return sure
 
 
 def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
