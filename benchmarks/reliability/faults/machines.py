@@ -23,7 +23,7 @@ IDLE = 2  # [s] after which a session moves to the archive
 QUORUM = 2
 # [ms] without an answer after which a sentinel takes a store for dead. It first pings a new master after so
 # long, or after a second if that is less: with less than a second here, it may take it for dead and go back.
-UNHEARD = 2000
+UNHEARD = 1200
 
 
 def cluster_node(scene: Scene) -> dict[str, Any]:
@@ -71,7 +71,10 @@ def sentinel(scene: Scene) -> dict[str, Any]:
 
         def mend(master: RedisServer, other: RedisServer) -> None:
             wait_for(lambda: _master(watcher) == other.port, 60.0, "a new master")
-            master.start("--replicaof", "127.0.0.1", str(other.port))
+            master.start()
+            wait_for(master.answers, 30.0, "the old master")
+            # As an option of its start, --replicaof, this waits for the next of Redis's rounds, one a second.
+            _ask(master, "REPLICAOF", "127.0.0.1", other.port)
 
         with Crowd([service.url], scene.starts, 4) as crowd:
             for _ in range(scene.n):
