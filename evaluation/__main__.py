@@ -1,7 +1,12 @@
 """`python -m evaluation evaluate | results | rewards | report ...`, where nothing is installed."""
 
-from evaluation.commands import curves, evaluate, habits, mujoco, report, results, rewards, rivals, worlds
+from evaluation import commands
 from specshield.cli import run
 
 if __name__ == "__main__":
-    run([evaluate, worlds, mujoco, results, rewards, curves, habits, rivals, report])
+    run(
+        [
+            commands.evaluate, commands.worlds, commands.mujoco, commands.results, commands.uncertainty,
+            commands.rewards, commands.curves, commands.habits, commands.rivals, commands.report,
+        ]
+    )  # fmt: skip

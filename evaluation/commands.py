@@ -147,6 +147,33 @@ def results(
     raise typer.Exit(1 if failed else 0)
 
 
+def uncertainty(
+    only: Annotated[
+        str,
+        typer.Option(help="Some of noise, worlds, forms, thresholds, mujoco, switches, robots, yardstick."),
+    ] = "",
+    share: Annotated[
+        float, typer.Option(help="Share of the runs, for a first look.", min=0.0, max=1.0)
+    ] = 1.0,
+    seed: Annotated[int, typer.Option(help="Decides all that is drawn in every campaign.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder to keep figures in and to take them up from.")] = Path(
+        "out/uncertainty"
+    ),
+    page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/results/uncertainty.md"),
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Measure sessions whose robot or map is not as they were told, and write the page of it."""
+    from evaluation.uncertainty.figures import carry_out
+    from evaluation.uncertainty.page import write
+    from evaluation.uncertainty.plan import PARTS
+
+    _check_page(page)
+    parts = _some(only, PARTS, "--only") if only else []
+    found, failed = carry_out(out, parts, share, seed, processes or cores())
+    write(page, found)
+    raise typer.Exit(1 if failed else 0)
+
+
 def rewards(
     case: Annotated[str, typer.Option(help="Cases, as 1,2.")] = "1,2",
     reward: Annotated[str, typer.Option(help="Some of paper, progress.")] = "paper,progress",

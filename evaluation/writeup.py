@@ -30,6 +30,7 @@ TITLES = {  # of the pages in a folder beside the summary
     "houses": "Other apartments",
     "bodies": "Keep-outs for the body and for the origin",
 }
+UNTOLD = "A world that is not as told, by a session's defaults"
 OTHERS = {  # pages beside the summary that commands of their own write
     "rewards": "The paper's reward to the letter, and seeds",
     "curves": "Thresholds below 1",
@@ -82,6 +83,7 @@ def write_up(folder: Path, page: Path) -> None:
                 ],
             )
     others = {title: beside / f"{name}.md" for name, title in TITLES.items()}
+    others |= {UNTOLD: beside / "uncertainty.md"}  # by `python -m evaluation uncertainty`
     others |= {title: page.with_name(f"{name}.md") for name, title in OTHERS.items()}
     _write(page, summary(parts["cases"], linked(page, others), parts["noise"], parts["tasks"]))
 
