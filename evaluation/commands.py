@@ -170,7 +170,7 @@ def uncertainty(
     _check_page(page)
     parts = _some(only, PARTS, "--only") if only else []
     found, failed = carry_out(out, parts, share, seed, processes or cores())
-    write(page, found)
+    write(page, found, seed)
     raise typer.Exit(1 if failed else 0)
 
 

@@ -7,17 +7,11 @@ from collections.abc import Iterator
 
 from evaluation.uncertainty.cells import Count, below, count, interval, number, total, where
 from evaluation.uncertainty.plan import CASES, UNTOLD, WORLDS
-from evaluation.uncertainty.sections import (
-    Found,
-    form_counts,
-    form_heads,
-    noise_rows,
-    threshold_counts,
-    world_counts,
-)
+from evaluation.uncertainty.sections import Found, form_count, noise_rows, threshold_counts, world_counts
 
 KEPT = {"gaussian": 99, "slip": 99, "rough": 95}  # [%] of runs
 MAIN, KL = 3, 1.3  # [points] less main tasks done, and times the KL, than in the exact world
+FORMS = ("gaussian", "slip")  # in which rules of other forms are tried
 SENSED = {"scan": 97, "contact": 92}  # [%] of what the oracle can keep
 BASE = 97  # [%] of the runs in MuJoCo
 OVER = 5  # [points] more than the threshold that was asked
@@ -54,27 +48,28 @@ def _kept(what: str, kept: Count, least: int) -> Iterator[str]:
 
 
 def _noise(found: Found, case: str) -> Iterator[str]:
-    """The row without caution is what the others are compared with, and so is that of the exact world."""
+    """The rule; then main tasks and KL beside those of the exact world, with caution and without."""
     rows = {said.partition(":")[0]: row for said, row in noise_rows(found, case)}
-    exact = [said for said in rows if said.startswith("exact")]
     for said, row in rows.items():
         yield from _kept(f"{case}, {said}", count(row["rule satisfied"]), KEPT.get(said, 0))
-        for other in exact[: exact.index(said)] if said in exact else exact:
-            yield from _costs(f"{case}, {said}", row, f"in the world that is {other}", rows[other])
+    for there in [said for said in rows if said.startswith("exact")]:
+        others = {said: row for said, row in rows.items() if not said.startswith("exact") or said < there}
+        yield from _costs(case, there, rows[there], others)
 
 
-def _costs(what: str, row: dict[str, str], there: str, other: dict[str, str]) -> Iterator[str]:
-    """Main tasks and KL beside those of the exact world."""
-    (done, n), (usual, m) = count(row["main task done"]), count(other["main task done"])
-    if 100 * done / n < 100 * usual / m - MAIN:
-        yield f"{what}: the main task is done in {interval(done, n)}, and {there} in {interval(usual, m)}."
-    kl, least = row["KL a run [nats]"], other["KL a run [nats]"]
-    if number(kl) > KL * number(least):
-        yield f"{what}: the KL of a run is {kl} nats, and {there} {least}{_times(number(kl), number(least))}."
-
-
-def _times(one: float, other: float) -> str:
-    return f", so {one / other:.2f} times as much" if other else ""
+def _costs(case: str, there: str, exact: dict[str, str], others: dict[str, dict[str, str]]) -> Iterator[str]:
+    done, least = count(exact["main task done"]), number(exact["KL a run [nats]"])
+    for said, row in others.items():
+        k, n = count(row["main task done"])
+        if 100 * k / n < 100 * done[0] / done[1] - MAIN:
+            yield f"{case}, {said}: the main task is done in {interval(k, n)}; {there}: {interval(*done)}."
+    more = {said: number(row["KL a run [nats]"]) for said, row in others.items()}
+    times = [f"{said} ({kl / least:.2f} times)" for said, kl in more.items() if kl > KL * least > 0.0]
+    if times:
+        yield (
+            f"{case}: the KL of a run is {exact['KL a run [nats]']} nats in the row {there}, and more than "
+            f"{KL:g} times as much in these: {', '.join(times)}."
+        )
 
 
 def _worlds(found: Found) -> Iterator[str]:
@@ -91,20 +86,14 @@ def _worlds(found: Found) -> Iterator[str]:
 
 
 def _forms(found: Found) -> Iterator[str]:
-    if "forms-worlds" in found:
-        for row in found["forms-worlds"].tables[0]:
-            for head, cell in row.items():
-                senses = head.partition(", ")[2]
-                if senses in SENSED:
-                    yield from _kept(f"{row['what']} ({row['method']}), {head}", count(cell), SENSED[senses])
-    if "forms" in found:
-        for head, said in form_heads(found["forms"].tables[0]).items():
-            config, _, noise = head.partition(", ")
-            if config == "default" and noise in KEPT:
-                for row, kept in zip(
-                    found["forms"].tables[0], form_counts(found["forms"], head), strict=True
-                ):
-                    yield from _kept(f"{row['what']} ({row['method']}), {said}", kept, KEPT[noise])
+    """Rule by rule, over all worlds, or over noise and slips: a cell has few runs."""
+    for row in found["forms-worlds"].tables[0] if "forms-worlds" in found else ():
+        for senses, least in SENSED.items():
+            counts = [count(cell) for head, cell in row.items() if head.endswith(f", {senses}")]
+            yield from _kept(f"{row['what']} ({row['method']}), these worlds, {senses}", total(counts), least)
+    for row in found["forms"].tables[0] if "forms" in found else ():
+        kept = total(form_count(row, f"default, {noise}", found["forms"].runs) for noise in FORMS)
+        yield from _kept(f"{row['what']} ({row['method']}), slips and noise", kept, KEPT[FORMS[0]])
 
 
 def _thresholds(found: Found) -> Iterator[str]:

@@ -21,16 +21,24 @@ runs, each with the commit at which it was measured and the date. No times are t
 beside."""
 
 
-def write(page: Path, found: Found) -> None:
-    """Writes the page from the figures that there are; what is not there is named."""
+def write(page: Path, found: Found, seed: int = 0) -> None:
+    """Writes the page from the figures that there are; what of the plan is not there is named."""
     parts = [INTRODUCTION, "## What falls short", AIMS, _bullets(shortfalls(found))]
-    absent = [f"`{each.command()}`" for each in plan() if each.name not in found]
+    absent = list(_absent(found, seed))
     if absent:
-        parts += ["## What was not measured", _bullets(absent)]
+        parts += ["## What was not measured, or with fewer runs", _bullets(absent)]
     for title, text, names, made in sections(found):
         parts += [f"## {title}", text, *made, commands(found, names)]
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text("\n\n".join(parts) + "\n")
+
+
+def _absent(found: Found, seed: int) -> Iterator[str]:
+    for each in plan(seed):
+        if each.name not in found:
+            yield f"`{each.command()}`"
+        elif found[each.name].runs < each.runs:
+            yield f"`{each.command()}`: with `{each.counted} {found[each.name].runs}` alone"
 
 
 def _bullets(lines: Iterable[str]) -> str:

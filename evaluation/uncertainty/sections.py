@@ -37,7 +37,7 @@ Rules of seventeen forms in the apartment of case 1, by the planner or by reacha
 Each cell says how many runs were kept of those that the oracle can keep."""
 FORMS = """\
 The same rules where motions are exact, where 5 % of them slip, and with gaussian noise. Each cell says in how
-many of {runs} runs the rule was kept and, in brackets, the KL of a run."""
+many of {runs} runs the rule was kept and, in brackets, the mean KL of a run, without its interval."""
 THRESHOLDS = """\
 Sessions with `threshold_over: "episode"` in 20 small worlds. The model alone keeps the rule in 1 % of the
 episodes or so. Some of the worlds leave no time for slips, or no room for noise: how often the rule is kept
@@ -50,7 +50,7 @@ SWITCHES = """\
 Sessions that are switched to another rule, map or both while they run, through a server. A search of every
 future says whether the switch could be kept. In capitals is what must not happen."""
 ROBOTS_TEXT = """\
-Robots of `evaluation/worlds/robots.py` with the goal-seeking model, in the worlds of the section above.
+Robots of `evaluation/worlds/robots.py` with the goal-seeking model, in the same worlds as above.
 **locobot** has a centred footprint. **trailing** has its footprint 8 cm behind its origin, and **arcs** 5 cm.
 None can drive backwards."""
 
@@ -140,7 +140,8 @@ def forms(found: Found) -> Iterator[str]:
     heads = form_heads(measured.tables[0])
     rows = [(_rule(row), *_of(row, "method", *heads)) for row in measured.tables[0]]
     yield markdown(("rule", "method", *heads.values()), rows)
-    yield _summed({said: form_counts(measured, head) for head, said in heads.items()})
+    table, runs = measured.tables[0], measured.runs
+    yield _summed({said: [form_count(row, head, runs) for row in table] for head, said in heads.items()})
 
 
 def form_heads(table: Table) -> dict[str, str]:
@@ -154,9 +155,9 @@ def form_heads(table: Table) -> dict[str, str]:
     }
 
 
-def form_counts(measured: Measured, head: str) -> list[Count]:
-    """How many runs of each rule were kept: a cell is `39 (269)`."""
-    return [(int(row[head].split()[0]), measured.runs) for row in measured.tables[0]]
+def form_count(row: Mapping[str, str], head: str, runs: int) -> Count:
+    """How many runs were kept: a cell is `39 (269)`."""
+    return int(row[head].split()[0]), runs
 
 
 def _rule(row: Mapping[str, str]) -> str:

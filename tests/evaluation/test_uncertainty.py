@@ -29,6 +29,11 @@ FORMS = """\
 |---|---|---|--:|--:|--:|--:|--:|
 | until | `(not B) U[0,80] A -> C` | planner | 20 (116) | 5 (1) | 20 (142) | 19 (146) | 20 (158) |
 """
+FORMS_WORLDS = """\
+| what | rule | method | shift, scan | shift, contact | person, scan | person, contact | p99 [ms] |
+|---|---|---|--:|--:|--:|--:|--:|
+| order | `F[0,70] (A and F[0,70] B)` | planner | 8 of 8 | 7 of 8 | 8 of 8 | 7 of 8 | 40 |
+"""
 THRESHOLDS = """\
 | motions | asked | kept | 99 % interval | alone | worlds that can | kept there | 99 % interval |
 |---|--:|--:|---|--:|--:|--:|---|
@@ -69,6 +74,7 @@ def found():
         "case1-gaussian": evaluated(197, 194, 130.0),
         "case1-slip": evaluated(198, 193, 131.0),
         "case1-obstacle": measured(WORLDS, 60),
+        "forms-worlds": measured(FORMS_WORLDS, 8),
         "forms": measured(FORMS, 20),
         "thresholds": measured(THRESHOLDS, 1000),
         "switches": measured(SWITCHES, 13),
@@ -82,13 +88,13 @@ def test_each_figure_below_its_aim_is_told_and_no_other(found):
     """
     assert [line.partition(";")[0] for line in shortfalls(found)] == [
         "case1, gaussian: the rule is kept in 197 of 200 (95.7 to 99.7 %)",
-        "case1, slip: the main task is done in 193 of 200 (92.9 to 98.6 %), and in the world that is exact "
-        "in 200 of 200 (98.2 to 100.0 %).",
-        "case1, slip: the KL of a run is 131.0 (5.0 to 6.0) nats, and in the world that is exact 100.0 (5.0 "
-        "to 6.0), so 1.31 times as much.",
+        "case1, slip: the main task is done in 193 of 200 (92.9 to 98.6 %)",
+        "case1: the KL of a run is 100.0 (5.0 to 6.0) nats in the row exact, and more than 1.3 times as much "
+        "in these: slip (1.31 times).",
         "case1, obstacle, scan: the rule is kept in 57 of 59 (88.3 to 99.6 %)",
         "All these worlds together, scan: the rule is kept in 57 of 59 (88.3 to 99.6 %)",
-        "until (planner), default, slips: the rule is kept in 19 of 20 (75.1 to 99.9 %)",
+        "order (planner), these worlds, contact: the rule is kept in 14 of 16 (61.7 to 98.4 %)",
+        "until (planner), slips and noise: the rule is kept in 39 of 40 (86.8 to 99.9 %)",
         "MuJoCo, case1: the rule is kept in 58 of 60 (88.5 to 99.6 %)",
         "Switches: 1 are as they must not be (BROKEN).",
     ]
@@ -102,15 +108,21 @@ def test_the_page_has_each_command_with_its_commit_and_names_what_was_not_measur
     page.write(path, found)
     text = path.read_text()
     assert "\npython -m benchmarks.forms --seed 0 --runs 200  # abcdef0, 2026-11-28\n" in text
-    absent = text.partition("## What was not measured")[2].partition("\n## ")[0]
+    absent = text.partition("## What was not measured, or with fewer runs")[2].partition("\n## ")[0]
     assert "- `python -m evaluation worlds --case case2 --world person --seed 0 --runs 60`\n" in absent
     assert "--case case1 --world obstacle" not in absent
+    assert (
+        "- `python -m evaluation mujoco --case 1,2,drawn_3 --seed 0 --runs 100`: with `--runs 60` alone\n"
+        in absent
+    )
     assert (
         "| gaussian: off by sigma 0.01 m and 0.5 degrees | 197 of 200 (1 to 2 %) | 194 of 200 (3 to 4 %) |"
         in text
     )
     assert "| obstacle, contact | 55 of 59 (83.5 to 98.1 %) |" in text
     assert "| until: `(not B) U[0,80] A -> C` | planner | 20 (116) |" in text
+    assert "| order: `F[0,70] (A and F[0,70] B)` | planner | 8 of 8 | 7 of 8 | 8 of 8 | 7 of 8 |\n" in text
+    assert "The 95 % intervals: 8 of 8 (63.1 to 100.0 %); 7 of 8 (47.3 to 99.7 %)." in text
     assert "- default, slips: 19 of 20 (75.1 to 99.9 %)\n" in text
     assert "| noise | 0.95 | 827 of 1000 (80.2 to 85.0 %) | 13 | 644 of 650 (98.0 to 99.7 %) |" in text
     assert "As it should be: 12 of 13 (64.0 to 99.8 %)." in text
