@@ -20,7 +20,7 @@ import httpx
 import numpy as np
 
 from specshield.client import LocalDecision, ShieldClient
-from specshield.client.bounded import Transport
+from specshield.client.network.bounded import Transport
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import Case, load_case

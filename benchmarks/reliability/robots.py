@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import httpx
 
 from specshield.client import ShieldClient
-from specshield.client.bounded import Transport
+from specshield.client.network.bounded import Transport
 from specshield.errors import (
     Busy,
     InputError,

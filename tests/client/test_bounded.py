@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import httpx
 import pytest
 
-from specshield.client import bounded
+from specshield.client.network import bounded
 from tests.serving import HUNG, wait_for
 
 

@@ -369,4 +369,4 @@ def test_importing_the_client_brings_httpx_and_nothing_heavy():
         "sorted(name for name in sys.modules if name.startswith('specshield.') and '.client' not in name))"
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert output.strip() == "[] ['specshield.errors', 'specshield.wiring']"
+    assert output.strip() == "[] ['specshield.errors']"

@@ -18,9 +18,10 @@ from test_shells import NO_NAME
 from websockets.sync.server import serve
 
 from specshield import errors
-from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient, stream
+from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient
 from specshield.client.models import build
-from specshield.client.stream import leave
+from specshield.client.network import stream
+from specshield.client.network.stream import leave
 from tests.serving import wait_for
 
 POSE, LOGITS = (0.0, 0.0, 0.0), [0.0, None]

@@ -12,13 +12,14 @@ from typing import Any, Generic, cast
 
 import httpx
 
-from specshield.client import bounded, calls
+from specshield.client import calls
 from specshield.client.core import D, Feed, Flow, More, T, Wait, page_of
 from specshield.client.models import Decision, Page
+from specshield.client.network import bounded
+from specshield.client.network.stream import AsyncStreams, packed
+from specshield.client.network.transport import STALE, Exchange, address, headers
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
-from specshield.client.stream import AsyncStreams, packed
-from specshield.client.transport import STALE, Exchange, address, headers
 from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from specshield.client.core import Feed, Flow, More, Wait, fetch
 from specshield.client.models import Decision
-from specshield.client.stream import LONGEST
+from specshield.client.network.stream import LONGEST
 from specshield.client.wire import TRIES, Failure, Request, path
 from specshield.errors import ServerError
 

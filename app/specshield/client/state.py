@@ -31,6 +31,7 @@ from specshield.client.models import (
 )
 from specshield.client.resources import deciding, stepping
 from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
+from specshield.client.wiring import Wiring
 from specshield.errors import (
     HistoryConflict,
     HistoryGap,
@@ -39,7 +40,6 @@ from specshield.errors import (
     SpecshieldError,
     StepConflict,
 )
-from specshield.wiring import Wiring
 
 
 class SessionState:

@@ -195,7 +195,7 @@ def _port(port: int) -> Iterator[Finding]:
 def _server(url: str) -> Iterator[Finding]:
     import httpx
 
-    from specshield.client.transport import address
+    from specshield.client.network.transport import address
 
     began, at = time.time(), str(address(url)).rstrip("/")
     elsewhere = "specshield serve, or another --url"

@@ -23,6 +23,7 @@ from specshield.client.models import (
     execute_of,
 )
 from specshield.client.wire import Logits, Numbers, Points
+from specshield.client.wiring import Wiring
 from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished
 from specshield.local.rule import Rule, told
 from specshield.reasons import refusal
@@ -34,7 +35,6 @@ from specshield.shield.decision import Shield
 from specshield.shield.signals import any_signal
 from specshield.shield.surprise.slip import SAME_POSE
 from specshield.task import Task, check_signals
-from specshield.wiring import Wiring
 
 if TYPE_CHECKING:
     from specshield.local.shield import LocalShield

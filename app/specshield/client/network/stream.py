@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from specshield.client.bounded import in_thread
-from specshield.client.transport import STALE, Exchange
+from specshield.client.network.bounded import in_thread
+from specshield.client.network.transport import STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
 

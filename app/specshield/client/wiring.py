@@ -11,10 +11,9 @@ import logging
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:  # the SDK imports this module
-    from specshield.client.models import Decision, Pose
+from specshield.client.models import Decision, Pose
 
 KEPT = 24  # [motions] looked at: a mistake shows in a few seconds, and one of long ago does not count
 ENOUGH = 6  # [motions] that only the mistake explains; chosen by hand

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from specshield.client import ShieldClient
+from specshield.client.wiring import between, diagnosed
 from specshield.local import LocalShield
-from specshield.wiring import between, diagnosed
 from specshield.world.occupancy import OccupancyGrid
 from tests.serving import RunningServer
 
