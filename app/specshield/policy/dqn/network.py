@@ -26,7 +26,10 @@ LINE = 16  # numbers that a processor reads at once: weights that lie across two
 
 
 class Network(NamedTuple):
-    """Observation -> w1 -> relu -> w2 -> relu -> w3 -> one Q-value a motion. Weights [inputs, outputs]."""
+    """Observation -> w1 -> relu -> w2 -> relu -> w3 -> one Q-value a motion. Weights [inputs, outputs].
+
+    Only `make_network` makes one: kernels read up to FEW numbers beyond the end of each array.
+    """
 
     w1: Singles
     b1: Singles
