@@ -48,7 +48,7 @@ class Wiring:
         self._told = False
 
     def note(self, t: int, pose: Pose, decision: Decision, executed: bool) -> None:
-        """Notes x_t and the decision there. executed: whether its `execute` is what the robot will run."""
+        """Notes x_t [m, m, rad] and the decision there. executed: whether its `execute` will be run."""
         last, self._last = self._last, (t, pose, decision) if executed else None
         if self._told or last is None or last[0] + 1 != t:
             return
