@@ -457,6 +457,11 @@ def test_steps(client, begin, step, fields, type, path):
     assert client.get(f"/v1/sessions/{session['id']}").json() == session
 
 
+def test_signals_that_are_no_object_are_told_so_in_the_words_of_json(begin, step):
+    told = step(begin(), t=0, poses=[START], logits=LOGITS, signals=[1.0])
+    assert problem(told, 422, "invalid-samples", "signals")["expected"] == "an object"
+
+
 def test_a_long_list_of_errors_stays_a_list(client, begin):
     """20 logits that are none and a long name: every entry whole, each of bounded size."""
     logits = ",".join(["NaN"] * 20)

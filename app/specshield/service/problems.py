@@ -189,7 +189,7 @@ def _expected(item: Mapping[str, Any]) -> str:
     told = {
         "extra_forbidden": "the fields that /docs lists",
         **dict.fromkeys(("missing", "union_tag_not_found"), "a value: this field is required"),
-        **dict.fromkeys(("model_type", "model_attributes_type"), "an object"),
+        **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "an object"),
         "int_parsing": "a whole number",
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
