@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield, start
+from specshield.shield.episode import Config, decide, make_shield, start
+from specshield.shield.uncertainty import Uncertainty
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -392,3 +394,55 @@ def test_of_many_first_motions_that_few_ways_begin_with_one_is_found():
     decision = decide(shield, np.array([[0.5, 1.0, 0.7]]), np.zeros(len(actions)))
     assert decision.mode == "shaped"
     assert sum(value > 0 for value in decision.j_values) >= 40
+
+
+FORWARD_ONLY = robot_from_json(
+    {
+        "footprint": {"radius": 0.1},
+        "on_contact": "stop",
+        "actions": [
+            {"name": "go", "translate": 0.2},
+            {"name": "left", "rotate": math.pi / 6},
+            {"name": "right", "rotate": -math.pi / 6},
+            {"name": "wait"},
+        ],
+    }
+)
+ISLE = {
+    "A": {"type": "rectangle", "min": [1.2, 0.9], "max": [2.2, 2.1]},
+    "B": {"type": "rectangle", "min": [3.5, 0.0], "max": [4.0, 3.0]},
+}
+
+
+@pytest.mark.parametrize("said", ["A -> F[0,18] B", "not A or F[0,18] B"])
+@pytest.mark.parametrize("doubts", [None, Uncertainty(0.0, 0.0, 0.05)])
+def test_a_response_begins_where_its_answer_is_nearest(said, doubts):
+    """The robot looks at A from the east. If it drives straight in, to x = 2.05, it turns round by 6 turns
+    and drives 8 times 0.2 m, beyond x = 3.5: 14 steps. If it turns round first and drives through a corner of
+    A, 8 or 9 steps are enough. A session that is told of slips does so, since it asks for 9 of the 18 steps.
+    """
+    grid = OccupancyGrid(np.zeros((60, 80), bool), 0.05, (0.0, 0.0, 0.0))
+    task = make_task(grid, FORWARD_ONLY, f"F[0,60] A and G[0,60] ({said})", ISLE)
+    policy = synthesise(task)
+    pose = np.array([2.65, 1.5, math.pi])
+
+    def took(motions):
+        """From the first step in A to the first in B."""
+        led = np.empty((len(motions), 3))
+        simulate(make_body(FORWARD_ONLY, grid), pose, np.array(motions), led)
+        there = (np.abs(led[:, 0] - 1.7) < 0.5) & (np.abs(led[:, 1] - 1.5) < 0.6)
+        return int(np.argmax(led[:, 0] > 3.5) - np.argmax(there))
+
+    ways = policy.propose(pose[None], {}, 0.0)
+    assert took(ways.motions[ways.preferred]) == 14
+    found = decide(make_shield([policy], Config(uncertainty=doubts)), pose[None], np.zeros(4))
+    went = took([found.action, *found.witness])
+    assert went <= 9 if doubts else went == 14
+    again = load_policy(policy.weights(), policy.card, task)
+    assert took(again.promptly().propose(pose[None], {}, 0.0).motions[0]) <= 9
+
+
+def test_a_rule_without_responses_is_planned_for_as_before():
+    policy = synthesise(WORLDS["patrol"].task, Settings(pitch=0.2))
+    assert policy.promptly() is policy
+    assert policy.chosen.shape[1] == 2

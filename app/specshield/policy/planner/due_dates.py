@@ -8,6 +8,7 @@ taken to keep their last value.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from specshield.compiled import kernel, leaf
 from specshield.policy.planner.literals import LAST, PREDICATE, SIDE, PackedLiterals
 from specshield.policy.progress.values import fill_place
 from specshield.stl.program import evaluate_packed
-from specshield.stl.tree import tree_bounds
+from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, tree_bounds
 
 NO_DATE = 1 << 40  # later than every step: the literal is not due
 
@@ -183,3 +184,15 @@ def stay_for(literals: PackedLiterals, k: int, s: int, by: int, most: int, bound
             low = tried
         tried = (low + high) // 2
     return high
+
+
+def cost_of(tree: Tree) -> float:
+    """What one evaluation of the bounds costs [about us]."""
+    work = 4.0 * tree.size
+    for op, length, a, b in zip(tree.op, tree.length, tree.a, tree.b, strict=True):
+        if op in (ALWAYS, EVENTUALLY):
+            passes = math.log2(b - a + 1) + 1 if length > 1 else b - a + 1
+        else:
+            passes = b + 1 if op == UNTIL else 1
+        work += 2.0 * length * passes
+    return 1e-3 * work

@@ -22,9 +22,17 @@ from specshield.policy.lattice import (
     corner,
     heading_after,
     leads_back,
+    values_at,
 )
+from specshield.policy.planner.literals import Literal
+from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.latest import sweep
-from specshield.robot.dynamics import Body, displacement
+from specshield.policy.reachability.sight import BESIDE, about
+from specshield.robot.dynamics import Body, displacement, make_body
+from specshield.rule.values import places, regions_of
+from specshield.stl import SATISFIED_ABOVE
+from specshield.stl.program import compile_predicates
+from specshield.task import Task
 
 OUT_OF_REACH = 1000.0  # [steps] what is farther counts as out of reach
 MOST = int(STEP_CODES * OUT_OF_REACH)  # the code of OUT_OF_REACH
@@ -41,6 +49,20 @@ class Fields(NamedTuple):
     cell: Int32s
     code: Codes
     pitch: float
+
+
+def holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tuple[Bools, Bools]:
+    """Where each literal holds, [L, ny, nx, H], with the signals at their initial values; and the same with
+    the poses near to narrow places, which the lattice does not see (reachability/sight.py).
+    """
+    known, body = places(task), make_body(task.robot, task.grid)
+    programs = compile_predicates([each.predicate for each in literals], known)
+    values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
+    sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
+    rho, valid, beside = values * sides, lattice.valid == 1, BESIDE * lattice.pitch
+    holds: Bools = (rho > SATISFIED_ABOVE) & valid
+    missed = [(rho[k] > -beside) & ~about(holds[k]) & valid for k in range(len(literals))]
+    return holds, holds | np.array(missed, np.bool_).reshape(holds.shape)
 
 
 def steps_to(lattice: Lattice, goal: Bools, keeps: Bools) -> Codes:

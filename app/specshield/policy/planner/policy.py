@@ -2,10 +2,9 @@
 
 For each predicate of the formula, and its negation where that is asked for, a field of the steps to go is
 computed once (fields.py). A decision asks the formula which literals are due (due_dates.py), and searches for
-a way that serves them (search.py). The shield certifies what is proposed like anything else, so a way that is
-not found costs permission, never safety; how often a way that exists is found is measured. The planner covers
+a way that serves them (search.py). A way that is not found costs permission, never safety. The planner covers
 what reachability does not: reactive rules over signals, patrols (G F), until, disjunctions of temporal parts,
-nested mixes. A robot that cannot stand still, or turn in place, is planned for too (docs/decisions.md).
+nested mixes.
 """
 
 from __future__ import annotations
@@ -21,22 +20,20 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from specshield.arrays import Bools, Codes, Floats, Int32s
+from specshield.arrays import Codes, Floats, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
+from specshield.policy.lattice import INVALID, STEP_CODES, Lattice, make_lattice, number_cells, pose_of
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds
-from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
+from specshield.policy.planner.due_dates import cost_of, foresee, is_open_if, make_bounds
+from specshield.policy.planner.fields import OUT_OF_REACH, Fields, holding, steps_to
 from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.progress.recall import residuals
-from specshield.policy.progress.values import initial_signals
-from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.reachability.stored import check_fit
 from specshield.policy.shape import headings_of, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
@@ -44,17 +41,16 @@ from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
 from specshield.rule.residual import all_of
-from specshield.rule.values import places, regions_of, signal_rows
+from specshield.rule.values import signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import moved, worst_signals
 from specshield.shield.proposal import Proposal
-from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
-from specshield.stl.program import compile_predicates
-from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Not, Or, conjuncts
 from specshield.task import Task
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
 MAX_FIELDS = 32  # further literals have no field, so no plan goes to where they hold
+NEAREST = 1.0  # [steps] more than the fewest to an answer still count as the fewest; chosen by hand
 USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effort of the settings
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
@@ -68,10 +64,11 @@ FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 class PlannerPolicy(Carded):
     """Plans at every decision.
 
-    chosen [L, 2]: for each literal of the formula the field that leads to it freely, and the one that keeps
-    what has to hold for a while; -1 for none. foreseen [S]: the values of the signals from x_{t+1} on; None:
-    their last values. share: of the effort that the settings allow. rest: the formula that is planned for if
-    parts are given up.
+    chosen [L, 2 or 4]: for each literal of the formula the field that leads to it freely, and the one that
+    keeps what has to hold for a while; -1 for none. If the formula has responses, the same again, but with
+    fields that lead the literals which begin one to where the answer is nearest. foreseen [S]: the values of
+    the signals from x_{t+1} on; None: their last values. share: of the effort that the settings allow. rest:
+    the formula that is planned for if parts are given up.
     """
 
     settings: Settings
@@ -97,6 +94,12 @@ class PlannerPolicy(Carded):
         """The policy without barred motions [n, 6] (robot/barred.py)."""
         return self._in(self._world._replace(barred=barred))
 
+    def promptly(self) -> PlannerPolicy:
+        """The policy that begins responses where their answers are nearest; itself if its rule has none."""
+        if not (chosen := self.chosen[:, 2:]).size:
+            return self
+        return replace(self, chosen=chosen)._in(self._world._replace(field=chosen.astype(np.int64)))
+
     def giving_up(self, lost: tuple[Formula, ...]) -> PlannerPolicy:
         """The policy for its rule without these parts: it proposes one way alone, with less effort."""
         parts = conjuncts(moved(self.task)[0])
@@ -117,7 +120,7 @@ class PlannerPolicy(Carded):
         packed, literals = literals_of(self.task, formula)
         _, all_literals = literals_of(self.task, self.task.formula)
         known = {each[:2]: (*of,) for each, of in zip(all_literals, self.chosen.tolist(), strict=True)}
-        leads = [known.get(each[:2], known.get(leading(each), (-1, -1))) for each in literals]
+        leads = [known.get(each[:2], known.get(leading(each), (-1, -1)))[:2] for each in literals]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
         # For a robot that cannot turn in place the lattice misses many ways, so its fields rule out nothing.
         band = BAND if turning_motion(self._body) >= 0 else 2.0 * OUT_OF_REACH
@@ -233,7 +236,7 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
     pitch = _pitch(task, settings)
     packed, literals = literals_of(task, task.formula)
     lattice = make_lattice(make_body(task.robot, task.grid), pitch)
-    (holds, near), free = _holding(task, lattice, literals), lattice.valid == 1
+    (holds, near), free = holding(task, lattice, literals), lattice.valid == 1
     used = free.any(axis=2)
     codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
     chosen = np.full((len(literals), 2), -1, np.int32)
@@ -248,8 +251,22 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
                 codes[k, keeps] = steps_to(lattice, near[k], allowed)[used]
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
             tell(FIELDS_SHARE * (column * len(literals) + k + 1) / (2 * len(literals)))
+    made, prompt = list(codes.values()), chosen.copy()
+    index = {each[:2]: k for k, each in enumerate(literals)}
+    for part in conjuncts(task.formula):
+        match part:
+            case Always(_, _, Implies(p, Eventually(_, _, q)) | Or((Not(p), Eventually(_, _, q)))):
+                k, answer = (index.get((each, 1), -1) for each in (p, q))
+                if min(k, answer) >= 0 and len(made) < MAX_FIELDS:
+                    own, left = (made[f] for f in chosen[[k, answer], 0])
+                    goal, keeps = np.zeros((2, *free.shape), np.bool_)
+                    here, keeps[used] = near[k][used] & (own != INVALID), own != INVALID
+                    goal[used] = here & (left <= left[here].min(initial=INVALID) + NEAREST * STEP_CODES)
+                    prompt[k] = len(made)
+                    made.append(steps_to(lattice, goal, keeps & (goal | ~near[k]))[used])
+    chosen = np.hstack([chosen, prompt]) if len(made) > len(codes) else chosen
     cell = number_cells(used)
-    code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
+    code = np.array(made, np.uint16).reshape(len(made), int(used.sum()), free.shape[2])
     # Trying it also leaves its kernels compiled where a server finds them.
     policy = PlannerPolicy(task, {}, settings, Fields(cell, code, pitch), chosen)
     share = policy.feasible_start(
@@ -262,7 +279,7 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
         share = policy.feasible_start(lattice, at_worst) if at_worst else 0.0
         metrics["feasible_start_any_signal"] = round(share, 4)
     size, took = int(code.nbytes + cell.nbytes), round(time.perf_counter() - began, 3)
-    metrics |= {"fields": len(codes), "size_bytes": size, "wall_time_s": took}
+    metrics |= {"fields": len(made), "size_bytes": size, "wall_time_s": took}
     return replace(policy, card=make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec))
 
 
@@ -275,7 +292,8 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     )
     usual = cell.shape == side_of(task.grid, settings.pitch)
     pitch = settings.pitch if usual else _pitch(task, settings)
-    fits = chosen.shape == (len(literals), 2) and bool(np.isin(chosen, np.arange(-1, len(code))).all())
+    shaped = chosen.shape in ((len(literals), 2), (len(literals), 4))  # 4 if the rule has responses
+    fits = shaped and bool(np.isin(chosen, np.arange(-1, len(code))).all())
     check_fit(cell, task, pitch, code, fits, f"a field for each of {len(literals)} literals")
     return PlannerPolicy(task, card, settings, Fields(cell, code, pitch), chosen)
 
@@ -299,20 +317,6 @@ def _pitch(task: Task, settings: Settings) -> float:
     return pitch
 
 
-def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tuple[Bools, Bools]:
-    """Where each literal holds, [L, ny, nx, H], with the signals at their initial values; and the same with
-    the poses near to narrow places, which the lattice does not see (reachability/sight.py).
-    """
-    known, body = places(task), make_body(task.robot, task.grid)
-    programs = compile_predicates([each.predicate for each in literals], known)
-    values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
-    sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
-    rho, valid, beside = values * sides, lattice.valid == 1, BESIDE * lattice.pitch
-    holds: Bools = (rho > SATISFIED_ABOVE) & valid
-    missed = [(rho[k] > -beside) & ~about(holds[k]) & valid for k in range(len(literals))]
-    return holds, holds | np.array(missed, np.bool_).reshape(holds.shape)
-
-
 def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
     """The literals that every way to a goal keeps; and these with those that may have to hold for a while.
     The former have to hold, whatever else happens, at half of all steps or more.
@@ -329,15 +333,3 @@ def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> 
         if 2 * sum(needed) >= len(needed):
             always.append(k)
     return always, [k for k in range(len(literals)) if k in always or literals[k].guards]
-
-
-def cost_of(tree: Tree) -> float:
-    """What one evaluation of the bounds costs [about us]."""
-    work = 4.0 * tree.size
-    for op, length, a, b in zip(tree.op, tree.length, tree.a, tree.b, strict=True):
-        if op in (ALWAYS, EVENTUALLY):
-            passes = math.log2(b - a + 1) + 1 if length > 1 else b - a + 1
-        else:
-            passes = b + 1 if op == UNTIL else 1
-        work += 2.0 * length * passes
-    return 1e-3 * work
