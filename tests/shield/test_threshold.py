@@ -9,6 +9,7 @@ import pytest
 
 from specshield.local import LocalShield
 from specshield.policy.reachability import policy as reachability
+from specshield.robot import robot_from_json
 from specshield.shield.caution.experience import learn
 from specshield.shield.caution.threshold import MOST_SLIPS, _in_time, chances
 from specshield.shield.episode import Config, close, decide, make_shield
@@ -16,7 +17,9 @@ from specshield.shield.feasibility import prefix_of
 from specshield.shield.judgement import Situation, judge
 from specshield.shield.proposal import Proposal
 from specshield.shield.uncertainty import Noise, Uncertainty
-from tests.oracles.cells import WAIT, Cells, ways
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.cells import FORWARD, WAIT, Cells, ways
 
 VECTORS = json.loads((Path(__file__).parents[1] / "oracles/storm/vectors.json").read_text())
 RULE, REGIONS = "F[0,4] A and F[5,12] B", {"A": (2, 0), "B": (0, 0)}
@@ -166,6 +169,49 @@ def test_noise_makes_late_by_a_normal_deviate_and_now_and_then_by_more(spare, ex
     late, due = np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2)), np.array([[25, spare, 25]])
     found = _in_time(Noise(0.01, 0.01, 0.0, 0.0, 1.0), 0.2, False, due, np.zeros(25, np.int64), -1, 0, late)
     assert found == pytest.approx(expected, abs=1e-6)
+
+
+class Ahead:
+    """Proposes to go three cells ahead and wait there."""
+
+    id = "ahead"
+
+    def __init__(self, task):
+        self.task = task
+
+    def propose(self, history, signals, margin):
+        motions = np.full((1, self.task.horizon + 1 - len(history)), self.task.robot.wait_motion)
+        motions[0, :3] = FORWARD
+        return Proposal(motions, self.task.robot.wait_motion)
+
+
+@pytest.mark.parametrize(("turns", "steers"), [((90,), False), ((), False), ((90, 30), True)])
+@pytest.mark.parametrize("room", [0.01, 0.02])
+def test_a_robot_that_cannot_steer_meets_the_walls_of_a_corridor_as_often_as_noise_leads_so_far(
+    room, turns, steers
+):
+    """The robot has `room` on both sides. Its place is three moves ahead and due in 12 steps."""
+    turned = [
+        {"name": f"{way}{turn}", "rotate": way * math.radians(turn)} for turn in turns for way in (1, -1)
+    ]
+    actions = [{"name": "forward", "translate": 0.2}, {"name": "wait"}, *turned]
+    robot = robot_from_json({"footprint": {"radius": 0.1 - room}, "actions": actions})
+    task = make_task(OccupancyGrid(np.zeros((1, 8), bool), 0.2), robot, "F[0,12] x > 0.8", {})
+    shield = make_shield(
+        [Ahead(task)],
+        Config(uncertainty=Uncertainty(0.005, math.radians(0.5), 0.0), threshold_over="episode"),
+    )
+    poses = np.array([[0.3, 0.1, 0.0]])
+    prefix = prefix_of(task, task.formula, shield.view, poses, {})
+    _, care = learn(shield, None, poses)
+    judged = judge(shield, Situation(prefix, None, "pending", care))
+    values = chances(shield, care, prefix, judged, np.zeros(len(robot.motions), bool))
+    off = math.hypot(0.005, 0.2 * math.radians(0.5))  # after one motion; the root of n times as much after n
+    met = sum(0.5 * math.erfc(room / (off * math.sqrt(2.0 * n))) for n in (1, 2, 3))
+    spread = 2.0 * math.hypot(0.005 / 0.2, math.radians(0.5) / 0.1)
+    late = 0.04 * spread * 12.0 * math.exp(-9.0 / 5.0)  # 9 steps are left beside the three
+    expected = math.exp(-late - (0.0 if steers else 0.75 * met))
+    assert expected - 0.01 <= values[0] <= expected
 
 
 @pytest.mark.parametrize("over", ["step", "episode"])

@@ -190,8 +190,7 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
         keeps = best_of(judged.tried.motions, judged.kept, len(risky))
         sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
         if sure.any():
-            rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)
-            robustness = np.append(rho, -np.inf)[robot.motion_of]
+            *_, robustness = _by_action(robot.motion_of, sure, keeps.robustness, keeps.row, judged.tried.rho)
             less = shield.config.margin > 0.0 or shield.config.slack > 0
             judged = judged._replace(aimed=Aimed(keeps, sure, 0.0, 0, less), robustness=robustness)
     if not sure.any() or np.array_equal(sure, judged.feasible_motion):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
-from specshield.compiled import kernel, leaf
+from specshield.compiled import leaf
 from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
 from specshield.shield.caution.experience import SELDOM, chance_of, was_stopped, went_on, within_noise
@@ -117,7 +117,8 @@ def teach(
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
         told = known is NONE and occupied is None and free is None and not stuck and followed.drawn >= 0
-        if told and _goes_as_told(shield.body, poses[-2], carry.next_poses[followed.drawn], poses[-1]):
+        told = told and is_near(carry.next_poses[followed.drawn, None], poses[-1], (SAME_PLACE, SAME_PLACE))
+        if told and not any(_covers(shield.body, poses[-2], poses[-1], np.empty(3))):
             return Taught(followed=moved_on(followed, as_drawn=True), here=here), ()
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
@@ -175,13 +176,6 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
     half_way[2] = before[2]
     half = overlap(body, half_way[0], half_way[1], half_way[2]) > UNDER
     return half, overlap(body, after[0], after[1], after[2]) > UNDER
-
-
-@kernel
-def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -> bool:
-    """Whether the robot is where f leads, but for rounding, and overlaps no obstacle. Poses (3,)."""
-    half, whole = _covers(body, before, after, np.empty(3))
-    return is_near(foreseen.reshape(1, 3), after, (SAME_PLACE, SAME_PLACE)) and not (half or whole)
 
 
 def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:

@@ -20,6 +20,8 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.portable import inner
+from specshield.robot.body import Body, centre, displacement
+from specshield.robot.contact import free_distance
 from specshield.rule.early import Conjuncts, conjunction_of, find_open
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Prefix, rho_of
@@ -33,6 +35,7 @@ GRID = 100  # V is rounded down to a multiple of 1 / GRID, so that actions which
 # Longer delays, chosen by hand beside what `python -m benchmarks.lateness` prints: how often a motion has
 # one, for each step of `spread_of` [1 / step], and how long it lasts in the mean [steps].
 HELD_UP, FOR = 0.04, 5.0
+SHARP, STOPS = 1.5, 0.75  # [rad] if no turn is smaller, this share of contacts ends a robot's way. By hand.
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # more slips of one future, or less probable ones, are not counted. By hand.
 
 
@@ -42,7 +45,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     """
     tried, task = judged.tried, shield.task
     view, parts = conjunction_of(task, prefix.formula)
-    leaves = tried.leaves
+    leaves, motion_of = tried.leaves, task.robot.motion_of
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
@@ -50,9 +53,9 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
     find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
-    motions, wait = tried.motions, task.robot.wait_motion
-    _chances(parts, still, prefix.t, care.noise, care.stride, care.margin, leaves, rho, motions, wait, values)
-    motion_of = task.robot.motion_of
+    blunt = all(abs(turn) >= SHARP for _, turn in task.robot.motions if turn != 0.0)
+    body, ways = (shield.body, blunt), (leaves, rho, tried.motions, tried.poses, task.robot.wait_motion)
+    _chances(parts, still, prefix.t, body, (care.noise, care.stride, care.margin), *ways, values)
     if judged.some:
         values[doubts & ~judged.feasible_motion] = 0.0
     return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
@@ -63,16 +66,19 @@ def _chances(
     parts: Conjuncts,
     still: Bools,
     t: int,
-    noise: Noise,
-    stride: float,
-    margin: float,
+    robot: tuple[Body, bool],
+    care: tuple[Noise, float, float],
     leaves: Floats,
     rho: Floats,
     motions: Ints,
+    poses: Floats,
     wait: int,
     values: Floats,
 ) -> None:
-    """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open."""
+    """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open. robot:
+    its body, and whether it has no turn below SHARP. care: the noise, stride and margin of the `Care`.
+    """
+    (body, blunt), (noise, stride, margin) = robot, care
     count, spread = still.shape[0], spread_of(noise, stride)
     sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
@@ -82,12 +88,13 @@ def _chances(
             continue
         copy_row(leaves[f], buffer)
         tree_value(parts.below, buffer)
-        chance, dwells = 1.0, 0
+        chance, dwells, last, made = 1.0, 0, 0, 0
         for k in range(count):
             due[k, 0] = 0
             if not still[k]:
                 continue
             due[k, 0], due[k, 1], due[k, 2] = _deadline(parts, k, t, margin, buffer)
+            last = max(last, due[k, 0])
             if parts.kind[k] == EVENTUALLY and parts.horizon[k] > 0:
                 dwells = max(dwells, due[k, 0])
             if not parts.plain[k] and (noise.slips > 0.0 or spread > 0.0):
@@ -96,9 +103,16 @@ def _chances(
                 for step in range(max(parts.a[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
                     deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
                     chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
+        for n in range(last if blunt and sigma > 0.0 else 0):
+            made += motions[f, n] != wait
+            if displacement(body, motions[f, n])[0] != 0.0:
+                off = sigma * math.sqrt(made)  # how far noise leads off a way if nothing mends it
+                u, v = centre(body, poses[f, n, 0], poses[f, n, 1], poses[f, n, 2])
+                room = free_distance(body, u, v, body.radius + 4.0 * off) - body.radius
+                chance *= math.exp(-STOPS * above(max(room, 0.0), off))
         if chance > 0.0 and (noise.slips > 0.0 or spread > 0.0):
-            never = _in_time(noise, spread, False, due, motions[f], wait, dwells, late)
-            slips = _in_time(noise, spread, True, due, motions[f], wait, dwells, late)
+            never = _in_time(noise, spread, False, due, motions[f, :last], wait, dwells, late)
+            slips = _in_time(noise, spread, True, due, motions[f, :last], wait, dwells, late)
             chance *= (1.0 - noise.slips) * never + noise.slips * slips
         values[motions[f, 0]] = max(values[motions[f, 0]], chance)
 
@@ -133,7 +147,7 @@ def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -
 def _in_time(
     noise: Noise, spread: float, slips: bool, due: Ints, motions: Ints, wait: int, dwells: int, late: Floats
 ) -> float:
-    """The probability that a robot which follows a future's motions (T - t,) meets all deadlines. It repeats
+    """The probability that a robot which follows a future's motions (n,) meets all deadlines. It repeats
     a motion that was not executed and, if it is late, leaves out waits, but not among the first `dwells`.
 
     slips: whether motions slip. due (K, 3): results of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2):
@@ -141,12 +155,10 @@ def _in_time(
     time for all that was due before. More slips than MOST_SLIPS, and those less likely than UNLIKELY, count
     as too late. What noise costs is rounded to whole steps.
     """
-    last, made, top = 0, 0, 0  # top: the most slips that are likely
-    for c in range(due.shape[0]):
-        last = max(last, due[c, 0])
+    made, top = 0, 0  # top: the most slips that are likely
     late[0, :] = 0.0
     late[0, 0] = 1.0
-    for n in range(1, last + 1):
+    for n in range(1, motions.shape[0] + 1):
         if motions[n - 1] == wait:
             if n > dwells:
                 for s in range(top + 1):
@@ -171,16 +183,13 @@ def _in_time(
             made += 1
         for c in range(due.shape[0]):
             if due[c, 0] == n:
-                for s in range(top + 1):
-                    for k in range(s + 1):
-                        spare, left = due[c, 1] - k, due[c, 2]
-                        longer = HELD_UP * spread * left * math.exp(-spare / FOR)
-                        late[s, k] *= (1.0 - above(spare + 0.5, spread * math.sqrt(left))) * math.exp(-longer)
-    sure = 0.0
-    for s in range(top + 1):
-        for k in range(s + 1):
-            sure += late[s, k]
-    return sure
+                for k in range(top + 1):
+                    spare, left = due[c, 1] - k, due[c, 2]
+                    longer = HELD_UP * spread * left * math.exp(-spare / FOR)
+                    in_time = (1.0 - above(spare + 0.5, spread * math.sqrt(left))) * math.exp(-longer)
+                    for s in range(k, top + 1):
+                        late[s, k] *= in_time
+    return float(late[: top + 1].sum())
 
 
 def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
@@ -195,6 +204,4 @@ def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools
     """d_{t+1} / V*_{t+1}; left: d_t / V*_t. In place of a terminal action the best one is executed."""
     best = float(values.max())
     expected = float(inner(distribution, np.where(terminal, best, values)))
-    if best <= 0.0 or expected <= 0.0:
-        return left
-    return min(left * best / expected, 1.0)
+    return min(left * best / expected, 1.0) if expected > 0.0 else left
