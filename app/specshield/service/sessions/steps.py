@@ -101,9 +101,7 @@ class Steps:
         """The answer. `timing` collects the seconds of rollout and store."""
         self.deciding += 1
         try:
-            if (
-                self.deciding > 1
-            ):  # requests that came together are all read before one is decided: fewer misses
+            if self.deciding > 1:  # what came together is all read before any is decided: fewer misses
                 await asyncio.sleep(0)
             return await self._answer(id, request, timing)
         finally:
@@ -128,6 +126,8 @@ class Steps:
             try:
                 session.check_step(request)
                 decided = await self._decide(session, request, timing)
+                if self.deciding > 1:  # and all are decided before one is written
+                    await asyncio.sleep(0)
             except SpecshieldError:
                 if current:
                     raise
