@@ -124,6 +124,7 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     sys.argv = ["specshield", *arguments]
     main_module = sys.modules["__main__"]
     main_module.__spec__ = main_module.__package__ = None  # which `python -m` has set
+    main_module.__file__ = cli.__file__  # which processes that it spawns import, and would import all of this
     if arguments[:1] == ["serve"]:
         prepared = _prepared()
         heavy.Template = lambda: prepared  # type: ignore[assignment,misc]
