@@ -2,9 +2,8 @@
 
     python -m specshield.service.warmup PART NICENESS    # compiles one part onto the disk, for startup.py
 
-The parts have few kernels in common, so that processes can compile them at the same time. Kernels that only
-some rules and robots need are compiled once the server is ready, so that no decision has to wait for them.
-The kernels of look-ahead are compiled when the first session with it begins.
+The parts have few kernels in common, so that processes can compile them at the same time. The kernels of
+look-ahead are compiled when the first session with it begins.
 """
 
 from __future__ import annotations
@@ -18,7 +17,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from llvmlite.binding import ffi
 from numba.core.caching import IndexDataCacheFile
+from numba.core.lowering import BaseLower
 
 from specshield.policy.dqn.network import NAMES, Network, make_network
 from specshield.policy.dqn.observation import observation_size
@@ -30,9 +31,9 @@ from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count, overlap, step, successors
-from specshield.service.sessions import record
+from specshield.service.sessions import packing, record
 from specshield.service.storage.keeper import at_end_of_input
-from specshield.shield import episode
+from specshield.shield import episode, shaping
 from specshield.shield.caution.experience import was_stopped
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.surprise.contact import cells_met
@@ -51,26 +52,31 @@ START, AWAY = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8)  # in A and out of it
 
 def warm_up(part: str) -> None:
     """Runs this part's kernels once: compiles them, or takes them from the disk."""
-    gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
-    {**PARTS, **LATER}[part](_task())
+    gc.set_threshold(10_000, 1_000_000)  # objects that the processor still has in its cache; older ones stay
+    {**PARTS, **LATER}[part]()
 
 
-def _propose(task: Task) -> None:
+def _propose() -> None:
     """The kernels by which reachability makes its tables and proposes. They take longest to compile."""
-    policy = synthesise(task)
+    policy = synthesise(task := _task())
     policy.propose(np.array([START]), {}, 0.0)
     body = make_body(task.robot, task.grid)
     for guess in (False, True):  # without a guess, known ways suffice; with one, ways are searched for
         policy.on_body(body, guess).propose(np.array([START]), {}, 0.0)
-    distances(body, goal_cells(body, make_rules(task)))
 
 
-def _decide(task: Task) -> None:
+def _decide() -> None:
     """The kernels by which the shield begins sessions, decides and refuses, with a DQN as the proposer: with
     an exact world, and with the defaults of a session.
     """
-    policy = Policy(task, {"id": "warm-up"}, _network(task))
+    # Those that need no task come first: meanwhile the process for reachability compiles those of a task.
     logits = np.zeros(len(STRETCH.actions))
+    prior = shaping.log_softmax(logits)
+    shaping.going_on(prior, STRETCH.terminal)
+    shaping.restrict(prior, ~STRETCH.terminal)
+    packing.pack_table(np.zeros((len(logits), packing.COLUMNS)), logits)
+    task = _task()
+    policy = Policy(task, {"id": "warm-up"}, _network(task))
     for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
         shield = make_shield([policy], config)
         episode.start(shield, START)
@@ -81,6 +87,7 @@ def _decide(task: Task) -> None:
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
     _in_trouble(policy, logits)
+    distances(shield.body, goal_cells(shield.body, make_rules(task)))
 
 
 def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
@@ -101,14 +108,11 @@ def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
         episode.decide(make_shield([policy], config), [START], logits)
 
 
-def _decide_rarely(task: Task) -> None:
+def _decide_rarely() -> None:
     """The kernels for late robots, narrow places, robots that only go ahead, and explanations."""
+    task, narrow = _task(), _task(A={"type": "circle", "center": [1.0, 1.0], "radius": 0.06})
     ahead = replace(task.robot, actions=tuple(each for each in task.robot.actions if each.translate >= 0.0))
-    for each in (
-        task,
-        _task(A={"type": "circle", "center": [1.0, 1.0], "radius": 0.06}),
-        replace(task, robot=ahead),
-    ):
+    for each in (task, narrow, replace(task, robot=ahead)):
         policy = synthesise(each)
         policy.earlier(1, np.full(len(each.robot.motions), True)).propose(np.array([AWAY]), {}, 0.0)
         shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
@@ -116,15 +120,15 @@ def _decide_rarely(task: Task) -> None:
         refusal(shield, np.array([AWAY]), {})
 
 
-def _plan(task: Task) -> None:
+def _plan() -> None:
     """The kernels of the planner."""
     from specshield.policy.planner import policy as planner
 
-    planner.synthesise(task).propose(np.array([START]), {}, 0.0)
+    planner.synthesise(_task()).propose(np.array([START]), {}, 0.0)
 
 
-PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
-LATER: dict[str, Callable[[Task], None]] = {"rarer decisions": _decide_rarely, "planner": _plan}
+PARTS: dict[str, Callable[[], None]] = {"reachability": _propose, "shield and dqn": _decide}
+LATER: dict[str, Callable[[], None]] = {"rarer decisions": _decide_rarely, "planner": _plan}
 
 
 def _task(**regions: dict[str, Any]) -> Task:
@@ -159,5 +163,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
     os.nice(int(sys.argv[2]))
+    BaseLower.create_cfunc_wrapper = lambda _: None  # type: ignore[method-assign]  # by which C would call
+    ffi.lib._lock._cblist.clear()  # events at each call of LLVM, to which nobody listens
     _keep_all()
     warm_up(sys.argv[1])
