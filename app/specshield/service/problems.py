@@ -238,9 +238,7 @@ def _allowed(request: Request) -> str:
     """All methods of a path, which may have several routes."""
     asked = [{**request.scope, "method": method} for method in ("DELETE", "GET", "PATCH", "POST", "PUT")]
     routes = request.app.routes
-    return ", ".join(
-        scope["method"] for scope in asked if any(r.matches(scope)[0] is Match.FULL for r in routes)
-    )
+    return ", ".join(one["method"] for one in asked if any(r.matches(one)[0] is Match.FULL for r in routes))
 
 
 def install(app: FastAPI) -> None:

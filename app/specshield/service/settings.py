@@ -29,9 +29,7 @@ class Settings(BaseSettings):
         env_prefix="SPECSHIELD_", frozen=True, extra="ignore", env_ignore_empty=True
     )
 
-    data_dir: Path = Field(
-        Path("data"), description="Uploaded maps, trained policies and the embedded store."
-    )
+    data_dir: Path = Field(Path("data"), description="Uploaded maps, trained policies, the embedded store.")
     data_url: str | None = Field(
         None,
         description="Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the "
@@ -92,9 +90,7 @@ class Settings(BaseSettings):
     heavy_timeout: float = Field(
         20.0, gt=0, le=LONGEST, description="Longest that reading an upload or drawing a map may take [s]."
     )
-    heavy_memory: int = Field(
-        1 << 30, ge=256 << 20, description="Most memory of a process that does that [bytes]."
-    )
+    heavy_memory: int = Field(1 << 30, ge=256 << 20, description="Most memory of such a process [bytes].")
 
     max_owner_bytes: int = Field(
         8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."

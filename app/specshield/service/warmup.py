@@ -24,8 +24,10 @@ from numba.core.lowering import BaseLower
 from specshield.policy.dqn.network import NAMES, Network, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
+from specshield.policy.lattice import Lattice
 from specshield.policy.progress import make_rules
 from specshield.policy.reachability.around.field import distances, goal_cells
+from specshield.policy.reachability.latest import sweep
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
@@ -69,7 +71,11 @@ def _decide() -> None:
     """The kernels by which the shield begins sessions, decides and refuses, with a DQN as the proposer: with
     an exact world, and with the defaults of a session.
     """
-    # Those that need no task come first: meanwhile the process for reachability compiles those of a task.
+    # Those that need no task come first, and one for reachability, whose process has more to compile and
+    # meanwhile compiles those of a task.
+    kinds = (np.uint8, 3), (np.float32, 4), (np.float32, 4), (np.int16, 4), (np.uint8, 4), (np.int64, 1)
+    nowhere = Lattice._make([1.0, 1, *(np.zeros((0,) * n, kind) for kind, n in kinds), 1])
+    sweep(nowhere, nowhere.valid, 0.0, np.zeros((0, 0, 0), np.float32))
     logits = np.zeros(len(STRETCH.actions))
     prior = shaping.log_softmax(logits)
     shaping.going_on(prior, STRETCH.terminal)
