@@ -210,7 +210,7 @@ def test_a_robot_that_cannot_steer_meets_the_walls_of_a_corridor_as_often_as_noi
     met = sum(0.5 * math.erfc(room / (off * math.sqrt(2.0 * n))) for n in (1, 2, 3))
     spread = 2.0 * math.hypot(0.005 / 0.2, math.radians(0.5) / 0.1)
     late = 0.04 * spread * 12.0 * math.exp(-9.0 / 5.0)  # 9 steps are left beside the three
-    expected = math.exp(-late - (0.0 if steers else 0.75 * met))
+    expected = math.exp(-late - (0.0 if steers else 0.5 * met))
     assert expected - 0.01 <= values[0] <= expected
 
 

@@ -35,7 +35,7 @@ GRID = 100  # V is rounded down to a multiple of 1 / GRID, so that actions which
 # Longer delays, chosen by hand beside what `python -m benchmarks.lateness` prints: how often a motion has
 # one, for each step of `spread_of` [1 / step], and how long it lasts in the mean [steps].
 HELD_UP, FOR = 0.04, 5.0
-SHARP, STOPS = 1.5, 0.75  # [rad] if no turn is smaller, this share of contacts ends a robot's way. By hand.
+SHARP, STOPS = 1.5, 0.5  # [rad] if no turn is smaller, this share of contacts ends a robot's way. By hand.
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # more slips of one future, or less probable ones, are not counted. By hand.
 
 
