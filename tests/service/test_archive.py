@@ -457,6 +457,26 @@ def test_no_step_is_lost_or_doubled_however_often_a_mover_is_killed(url, tmp_pat
     assert list(Path(place).rglob("*"))
 
 
+def test_a_file_that_is_written_while_its_session_is_erased_is_not_the_session(url, archive):
+    """As by a mover that is slow: it has read the session before, and removes its file afterwards."""
+
+    async def story(store: ArchivingStore) -> None:
+        await begin(store, "a", 3)
+        dump = await store.dump("a")
+        assert await store.delete("a")
+        archive.put("a", time.time() + TTL, dump)
+        assert await store.load("a") is None
+        assert await store.dump("a") is None
+        assert await store.append("a", dump.version, change(3)) is None
+        version = await begin(store, "a", 1)
+        assert not await store.put_away("a", time.time() + TTL, dump)
+        assert (await store.load("a")).version == version
+        assert await move(store, "a")
+        assert (await store.load("a")).version == version
+
+    run(url, archive, story)
+
+
 @contextmanager
 def archiving(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, Any]]]:
     """A client of a server whose sessions move to the archive after a second, and how to begin one there."""

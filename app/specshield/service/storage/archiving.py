@@ -81,7 +81,7 @@ class ArchivingStore(Store):
         self._files = anyio.CapacityLimiter(AT_ONCE)
 
     async def create(self, id: str, config: bytes, change: Change, *limits: tuple[str | None, int]) -> bytes:
-        if await self.in_thread(self.archive.find, id) is not None:
+        if await self.in_thread(self.archive.find, id) is not None and not await self._was_erased(id):
             raise exists(id)
         return await super().create(id, config, change, *limits)
 
@@ -89,7 +89,7 @@ class ArchivingStore(Store):
         """Two round trips and a file where the session is not in the store."""
         if (found := await super().load(id, t)) is not None:
             return found
-        dump = await self.in_thread(self._archived, id)
+        dump = await self._in_archive(id)
         if dump is None:  # or it has just come back
             return await super().load(id, t)
         step = dump.steps[t] if t is not None and t < len(dump.steps) else None
@@ -105,7 +105,7 @@ class ArchivingStore(Store):
 
     async def dump(self, id: str) -> Dump | None:
         found = await super().dump(id)
-        return found if found is not None else await self.in_thread(self._archived, id)
+        return found if found is not None else await self._in_archive(id)
 
     async def delete(self, id: str) -> bool:
         """Erases a session in store and archive. False if there was none."""
@@ -194,7 +194,7 @@ class ArchivingStore(Store):
 
     async def _bring_back(self, id: str) -> bool:
         """Brings a session back from the archive. False if the archive does not have it."""
-        dump = await self.in_thread(self._archived, id)
+        dump = await self._in_archive(id)
         if dump is None:
             return False
         contents = [dump.config, dump.state, dump.rows, *dump.steps]
@@ -203,6 +203,17 @@ class ArchivingStore(Store):
             await self._return(keys=_keys(id), args=[dump.version, FENCE, self._ttl * 1000, *contents])
         await self.list_name(id)
         return True
+
+    async def _in_archive(self, id: str) -> Dump | None:
+        dump = await self.in_thread(self._archived, id)
+        return None if dump is None or await self._was_erased(id) else dump
+
+    async def _was_erased(self, id: str) -> bool:
+        """Whether the last that became of a session is that it was erased: a file of it that is found all the
+        same was written meanwhile, and whoever wrote it removes it at once.
+        """
+        async with self._reaching():
+            return bool(await self.redis.get(_keys(id)[-1]) == b"erased")
 
     def _archived(self, id: str) -> Dump | None:
         for _ in range(TRIES):
