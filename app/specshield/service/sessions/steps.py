@@ -126,8 +126,6 @@ class Steps:
             try:
                 session.check_step(request)
                 decided = await self._decide(session, request, timing)
-                if self.deciding > 1:  # and all are decided before one is written
-                    await asyncio.sleep(0)
             except SpecshieldError:
                 if current:
                     raise
