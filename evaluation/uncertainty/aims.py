@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from evaluation.uncertainty.cells import Count, below, count, interval, number, total, where
-from evaluation.uncertainty.plan import CASES, UNTOLD, WORLDS
+from evaluation.uncertainty.plan import CASES, ROBOTS, UNTOLD, WORLDS
 from evaluation.uncertainty.sections import Found, form_count, noise_rows, threshold_counts, world_counts
 
 KEPT = {"gaussian": 99, "slip": 99, "rough": 95}  # [%] of runs
@@ -36,6 +36,12 @@ def shortfalls(found: Found) -> Iterator[str]:
     if "mujoco" in found:
         for row in found["mujoco"].tables[0]:
             yield from _kept(f"MuJoCo, {row['case']}", count(row["kept"]), BASE)
+    for robot in ROBOTS:
+        for case in CASES:
+            for row in found[f"{robot}-{case}"].tables[0] if f"{robot}-{case}" in found else ():
+                kept = count(row["kept of what the oracle can keep"])
+                what = f"{robot}, {case}, {row['world']}, {row['senses']}"
+                yield from _kept(what, kept, SENSED[row["senses"]])
     if "switches" in found:
         for row in found["switches"].tables[0]:
             if re.search("[A-Z]{3}", row[""]):
