@@ -17,13 +17,14 @@ from typing import Any, TypeVar
 
 import httpx
 
-from specshield.client import ShieldClient
+from specshield.client import Session, ShieldClient
 from specshield.client.network.bounded import Transport
 from specshield.errors import (
     Busy,
     InputError,
     InsufficientStorage,
     ServerError,
+    SessionExists,
     Starting,
     StoreError,
     TransportError,
@@ -133,11 +134,7 @@ class Robot(threading.Thread):
         url = self.urls[episode.seed % len(self.urls)]
         client = ShieldClient(url, timeout=TIMEOUT, transport=Recording(url, self.tries))
         try:
-            session = _persist(
-                lambda: client.sessions.create(
-                    policy_id=POLICY, initial_pose=tuple(episode.start), seed=episode.seed, id=episode.id
-                )
-            )
+            session = _persist(lambda: _begin(client, episode))
             pose = tuple(episode.start)
             while session.spec_status == "pending":
                 logits = logits_of(episode.seed, session.t)
@@ -189,6 +186,16 @@ class Robot(threading.Thread):
                 raise ServerError(f"{path}: {status} {content[:300]!r}")
             time.sleep(PAUSE)
         raise TimeoutError(f"{path}: no answer in {PATIENCE} s")
+
+
+def _begin(client: ShieldClient, episode: Episode) -> Session:
+    """A session, or the one that a call before has begun without hearing of it: ids are never used again."""
+    try:
+        return client.sessions.create(
+            policy_id=POLICY, initial_pose=tuple(episode.start), seed=episode.seed, id=episode.id
+        )
+    except SessionExists:
+        return client.sessions.get(episode.id)
 
 
 def _persist(call: Callable[[], T]) -> T:
