@@ -90,7 +90,11 @@ class Settings(BaseSettings):
     heavy_timeout: float = Field(
         20.0, gt=0, le=LONGEST, description="Longest that reading an upload or drawing a map may take [s]."
     )
-    heavy_memory: int = Field(1 << 30, ge=256 << 20, description="Most memory of such a process [bytes].")
+    heavy_memory: int = Field(
+        1 << 30,
+        ge=256 << 20,
+        description="Most memory of a process that reads an upload or draws a map [bytes].",
+    )
 
     max_owner_bytes: int = Field(
         8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."

@@ -111,7 +111,7 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         startup.failure = str(error)
     except Exception as error:
         log.exception("the kernels cannot be compiled")
-        startup.failure = f"kernels cannot be compiled: {type(error).__name__}; the server's log says more"
+        startup.failure = f"the kernels cannot be compiled: {type(error).__name__}; see the server's log"
 
 
 async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
@@ -160,7 +160,10 @@ async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore, ni
 
 
 async def _tell() -> None:
-    log.info("compiling the kernels that are not on the disk: all take about %d s on two quiet cores", TAKES)
+    log.info(
+        "compiling the kernels that are not on the disk: all of them take about %d s on two quiet cores",
+        TAKES,
+    )
     while True:
         await asyncio.sleep(TELL_EVERY)
         log.info("%d of about %d kernels are compiled", on_disk(), KERNELS)

@@ -71,8 +71,8 @@ def _decide() -> None:
     """The kernels by which the shield begins sessions, decides and refuses, with a DQN as the proposer: with
     an exact world, and with the defaults of a session.
     """
-    # Those that need no task come first, and one for reachability, whose process has more to compile and
-    # meanwhile compiles those of a task.
+    # First those that need no task, so that the other process compiles those of a task meanwhile. `sweep` is
+    # one of the other's, which has more to compile.
     kinds = (np.uint8, 3), (np.float32, 4), (np.float32, 4), (np.int16, 4), (np.uint8, 4), (np.int64, 1)
     nowhere = Lattice._make([1.0, 1, *(np.zeros((0,) * n, kind) for kind, n in kinds), 1])
     sweep(nowhere, nowhere.valid, 0.0, np.zeros((0, 0, 0), np.float32))
@@ -169,7 +169,9 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
     os.nice(int(sys.argv[2]))
-    BaseLower.create_cfunc_wrapper = lambda _: None  # type: ignore[method-assign]  # by which C would call
-    ffi.lib._lock._cblist.clear()  # events at each call of LLVM, to which nobody listens
+    # Left out is what takes time and nobody uses: wrappers by which C calls numba's own functions, and events
+    # at each call of LLVM.
+    BaseLower.create_cfunc_wrapper = lambda _: None  # type: ignore[method-assign]
+    getattr(getattr(ffi.lib, "_lock", None), "_cblist", []).clear()
     _keep_all()
     warm_up(sys.argv[1])

@@ -67,10 +67,10 @@ def judge(shield: Shield, now: Situation) -> Judged:
     """Tries the futures from x_t, and judges each motion by the best of its futures."""
     prefix, tail, care, violated = now.prefix, now.tail, now.care, now.status == "violated"
     robot, asked, roomy = shield.task.robot, care.margin, care.room and not violated
-    hows = ["keeping_clear"] * roomy + ["promptly"] * (not (care.guess or shield.config.uncertainty is None))
-    both = [(each, adapted(each, how)) for how in hows for each in shield.proposers]
-    if more := tuple(policy for each, policy in both if policy is not each):
-        shield = replace(shield, proposers=(*shield.proposers, *more))
+    hows = ["keeping_clear"] * roomy + ["promptly"] * bool(shield.config.uncertainty and not care.guess)
+    asks = ((each, adapted(each, how)) for how in hows for each in shield.proposers)
+    more = tuple(policy for each, policy in asks if policy is not each)
+    shield = replace(shield, proposers=(*shield.proposers, *more)) if more else shield
     motions = len(robot.motions)
     # Several guesses about the map may be tried in one decision, so each is tried without a margin first.
     margins = (0.0,) if care.guess and not violated else (asked, 0.0)

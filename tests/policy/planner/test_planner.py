@@ -431,15 +431,18 @@ def test_a_response_begins_where_its_answer_is_nearest(said, doubts):
         led = np.empty((len(motions), 3))
         simulate(make_body(FORWARD_ONLY, grid), pose, np.array(motions), led)
         there = (np.abs(led[:, 0] - 1.7) < 0.5) & (np.abs(led[:, 1] - 1.5) < 0.6)
+        assert there.any()
+        assert led[-1, 0] > 3.5
         return int(np.argmax(led[:, 0] > 3.5) - np.argmax(there))
 
     ways = policy.propose(pose[None], {}, 0.0)
     assert took(ways.motions[ways.preferred]) == 14
     found = decide(make_shield([policy], Config(uncertainty=doubts)), pose[None], np.zeros(4))
     went = took([found.action, *found.witness])
-    assert went <= 9 if doubts else went == 14
+    assert went in ((8, 9) if doubts else (14,))
     again = load_policy(policy.weights(), policy.card, task)
-    assert took(again.promptly().propose(pose[None], {}, 0.0).motions[0]) <= 9
+    ways = again.promptly().propose(pose[None], {}, 0.0)
+    assert took(ways.motions[ways.preferred]) in (8, 9)
 
 
 def test_a_rule_without_responses_is_planned_for_as_before():

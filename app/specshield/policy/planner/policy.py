@@ -65,8 +65,8 @@ class PlannerPolicy(Carded):
     """Plans at every decision.
 
     chosen [L, 2 or 4]: for each literal of the formula the field that leads to it freely, and the one that
-    keeps what has to hold for a while; -1 for none. If the formula has responses, the same again, but with
-    fields that lead the literals which begin one to where the answer is nearest. foreseen [S]: the values of
+    keeps what has to hold for a while; -1 for none. If another part asks for what begins a response, the
+    same again, but with fields that lead there to where the answer is nearest. foreseen [S]: the values of
     the signals from x_{t+1} on; None: their last values. share: of the effort that the settings allow. rest:
     the formula that is planned for if parts are given up.
     """
@@ -95,7 +95,7 @@ class PlannerPolicy(Carded):
         return self._in(self._world._replace(barred=barred))
 
     def promptly(self) -> PlannerPolicy:
-        """The policy that begins responses where their answers are nearest; itself if its rule has none."""
+        """The policy that begins responses where their answers are nearest; itself if it has no such ways."""
         if not (chosen := self.chosen[:, 2:]).size:
             return self
         return replace(self, chosen=chosen)._in(self._world._replace(field=chosen.astype(np.int64)))
@@ -253,16 +253,18 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
             tell(FIELDS_SHARE * (column * len(literals) + k + 1) / (2 * len(literals)))
     made, prompt = list(codes.values()), chosen.copy()
     index = {each[:2]: k for k, each in enumerate(literals)}
+    most = min(MAX_FIELDS, MAX_ENTRIES // (int(used.sum()) * free.shape[2] or 1))
     for part in conjuncts(task.formula):
         match part:
             case Always(_, _, Implies(p, Eventually(_, _, q)) | Or((Not(p), Eventually(_, _, q)))):
                 k, answer = (index.get((each, 1), -1) for each in (p, q))
-                if min(k, answer) >= 0 and len(made) < MAX_FIELDS:
+                if min(k, answer) >= 0 and prompt[k, 0] == chosen[k, 0] and len(made) < most:
                     own, left = (made[f] for f in chosen[[k, answer], 0])
                     goal, keeps = np.zeros((2, *free.shape), np.bool_)
-                    here, keeps[used] = near[k][used] & (own != INVALID), own != INVALID
+                    keeps[used] = own != INVALID
+                    here = near[k][used] & keeps[used]
                     goal[used] = here & (left <= left[here].min(initial=INVALID) + NEAREST * STEP_CODES)
-                    prompt[k] = len(made)
+                    prompt[k] = len(made)  # the way touches what begins the response at its end alone
                     made.append(steps_to(lattice, goal, keeps & (goal | ~near[k]))[used])
     chosen = np.hstack([chosen, prompt]) if len(made) > len(codes) else chosen
     cell = number_cells(used)
@@ -292,7 +294,7 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     )
     usual = cell.shape == side_of(task.grid, settings.pitch)
     pitch = settings.pitch if usual else _pitch(task, settings)
-    shaped = chosen.shape in ((len(literals), 2), (len(literals), 4))  # 4 if the rule has responses
+    shaped = chosen.shape in ((len(literals), 2), (len(literals), 4))  # 4 with ways for `promptly`
     fits = shaped and bool(np.isin(chosen, np.arange(-1, len(code))).all())
     check_fit(cell, task, pitch, code, fits, f"a field for each of {len(literals)} literals")
     return PlannerPolicy(task, card, settings, Fields(cell, code, pitch), chosen)

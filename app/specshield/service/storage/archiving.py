@@ -209,8 +209,9 @@ class ArchivingStore(Store):
         return None if dump is None or await self._was_erased(id) else dump
 
     async def _was_erased(self, id: str) -> bool:
-        """Whether the last that became of a session is that it was erased: a file of it that is found all the
-        same was written meanwhile, and whoever wrote it removes it at once.
+        """Whether a session was erased in the last `FENCE` seconds, and none of its id has left the store
+        since. A file of it that is found all the same was written meanwhile. Whoever wrote it removes it;
+        lists may name it until then. If that server has died, the session is back after `FENCE` seconds.
         """
         async with self._reaching():
             return bool(await self.redis.get(_keys(id)[-1]) == b"erased")
