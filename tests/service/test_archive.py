@@ -464,12 +464,13 @@ def test_a_file_that_is_written_while_its_session_is_erased_is_not_the_session(u
         await begin(store, "a", 3)
         dump = await store.dump("a")
         assert await store.delete("a")
-        archive.put("a", time.time() + TTL, dump)
+        expires = time.time() + TTL
+        archive.put("a", expires, dump)
         assert await store.load("a") is None
         assert await store.dump("a") is None
         assert await store.append("a", dump.version, change(3)) is None
         version = await begin(store, "a", 1)
-        assert not await store.put_away("a", time.time() + TTL, dump)
+        assert not await store.put_away("a", expires, dump)
         assert (await store.load("a")).version == version
         assert await move(store, "a")
         assert (await store.load("a")).version == version
