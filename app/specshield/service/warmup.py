@@ -2,8 +2,8 @@
 
     python -m specshield.service.warmup PART NICENESS    # compiles one part onto the disk, for startup.py
 
-The parts have few kernels in common, so that processes can compile them at the same time. The kernels of
-look-ahead are compiled when the first session with it begins.
+The parts have few kernels in common, so that processes can compile them at the same time. LATER is compiled
+once the server is ready, before a decision needs it; look-ahead's kernels when a session with it begins.
 """
 
 from __future__ import annotations

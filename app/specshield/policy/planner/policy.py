@@ -264,8 +264,9 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
                     keeps[used] = own != INVALID
                     here = near[k][used] & keeps[used]
                     goal[used] = here & (left <= left[here].min(initial=INVALID) + NEAREST * STEP_CODES)
-                    prompt[k] = len(made)  # the way touches what begins the response at its end alone
-                    made.append(steps_to(lattice, goal, keeps & (goal | ~near[k]))[used])
+                    prompt[k] = len(made)
+                    allowed = keeps & (goal | ~near[k])  # the response begins at the way's end, not before
+                    made.append(steps_to(lattice, goal, allowed)[used])
     chosen = np.hstack([chosen, prompt]) if len(made) > len(codes) else chosen
     cell = number_cells(used)
     code = np.array(made, np.uint16).reshape(len(made), int(used.sum()), free.shape[2])
