@@ -19,6 +19,9 @@ from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.cores import cores
 from specshield.errors import Starting, TransportError
+from specshield.service.heavy.uploads import policies_of
+from specshield.service.sessions.shields import Shields
+from specshield.service.settings import Settings
 from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, READY, Startup
 from tests.serving import serving, wait_for
 
@@ -99,7 +102,7 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         copied = sum(1 for _ in compiled.SHIPPED.rglob("*.nbi"))
         assert told["kernels"]["compiled"] < copied + 10
         assert told["kernels"]["expected"] > 10
-        assert told["parts"] == {"reachability": "compiling", "shield and dqn": "compiling"}
+        assert told["parts"] == {"reachability": "compiling", "shield": "compiling"}
         wait_for(lambda: starting(server.url))
         fcntl.flock(lock, fcntl.LOCK_UN)
         wait_for(lambda: len(compiling(kernels)) == min(2, cores()))
@@ -138,6 +141,17 @@ def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete
     with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete)):
         wait_for(lambda: list(incomplete.glob(f"{COMPLETE}-*[!k]")))
     assert list(incomplete.rglob("due_dates.make_bounds-*.nbi"))
+
+
+def test_decisions_of_a_dqn_are_made_elsewhere_until_its_kernels_are_compiled(tmp_path):
+    startup = Startup(completing=True)
+    shields = Shields(policies_of(Settings(data_dir=tmp_path)), 10, startup.has)
+    learned, computed = (shields.policies.find(name, "").id for name in ("case1-dqn", "case1"))
+    assert shields.slow_policies([learned])
+    assert not shields.slow_policies([computed])
+    startup.parts.append("dqn")
+    assert not shields.slow_policies([learned])
+    assert Startup().has("dqn")  # a server that is not to compile it
 
 
 def test_a_server_that_is_not_to_does_not_compile_what_few_need(tmp_path, incomplete):

@@ -7,9 +7,11 @@ import sys
 
 SCRIPT = """
 import gc
+import json
 from dataclasses import replace
 import numpy as np
 from numba.core.dispatcher import Dispatcher
+from specshield.policy.methods import load_policy
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
@@ -18,6 +20,7 @@ from specshield.service import warmup
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.uncertainty import Uncertainty
+from specshield.shipped import MODELS
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 
@@ -47,6 +50,13 @@ print("ready:", *sorted({name for name, _ in ready() - before}))
 for part in warmup.LATER:
     warmup.warm_up(part)
 before = ready()
+card = json.loads((MODELS / "case1-dqn" / "card.json").read_text())
+learned = load_policy(MODELS / "case1-dqn" / "policy.safetensors", card, case.task)
+for threshold in (1.0, 0.5):
+    for config in (Config(threshold), Config(threshold, uncertainty=Uncertainty(), learn_map=True)):
+        shield = make_shield([learned], config)
+        first = episode.decide(shield, [start], logits)
+        episode.decide(shield, [start, start], logits, carry=first.carry, occupied=ring, explain=explanations)
 robot, grid = case.task.robot, case.task.grid
 ahead = replace(robot, actions=tuple(each for each in robot.actions if each.translate >= 0.0))
 narrow = {"A": {"type": "circle", "center": [5.5, 5.0], "radius": 0.07}}

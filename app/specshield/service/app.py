@@ -129,7 +129,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
                 worker.ensure()
 
     watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping, lambda: steps.deciding)
-    sessions = Sessions(settings, store, known, heavy, watchers.decided)
+    sessions = Sessions(settings, store, known, heavy, watchers.decided, startup.has)
     steps = sessions.steps
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
     keys, gauges = Keys(store.redis, own), Gauges(store, jobs)

@@ -29,8 +29,8 @@ from specshield.service.storage.keeper import private
 # The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; the file `complete`,
 # that the kernels that only some rules and robots need are there too.
 READY, COMPLETE = "ready", "complete"
-KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 70  # [s] of a first start on two quiet cores; 29 to 73 were measured (`make wheels` prints it)
+KERNELS = 228  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
+TAKES = 70  # [s] of a first start on two quiet cores; 27 to 73 were measured (`make wheels` prints it)
 TELL_EVERY = 5.0  # [s] between two lines of the log
 LOW = 10  # niceness of compiling in the background: with 19 it makes no progress beside 8 busy programs
 CHECK_EVERY = 0.25  # [s] between two looks whether another process has compiled them
@@ -46,6 +46,7 @@ class Startup:
 
     stopping: whether the server was told to stop. failure: why it cannot become ready. compiling: whether
     kernels may be missing on the disk. parts: the parts of the kernels that this start has compiled.
+    completing: whether it may still compile those of warmup.LATER.
     """
 
     ready: bool = False
@@ -53,6 +54,11 @@ class Startup:
     failure: str | None = None
     compiling: bool = False
     parts: list[str] = field(default_factory=list)
+    completing: bool = False
+
+    def has(self, part: str) -> bool:
+        """Whether this part's kernels are compiled, or no process is going to compile them."""
+        return part not in warmup.LATER or not self.completing or part in self.parts
 
     def problem(self) -> SpecshieldError | None:
         """Why requests should not come here: the server is not ready yet, or about to stop. Else None."""
@@ -118,6 +124,7 @@ async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
     """Once the server is ready, compiles the kernels that only some rules and robots need, in `at_once`
     processes. Else their first decision would compile them, while all others wait. False if some are missing.
     """
+    startup.completing = True
     while not startup.ready:
         await asyncio.sleep(CHECK_EVERY)
     try:
@@ -131,6 +138,8 @@ async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
         log.warning("some kernels are not compiled: the first decision that needs one will wait for it")
     except Exception as error:  # as when there is no room for a file or a process
         log.warning("the other kernels cannot be compiled now: %r", error)
+    finally:
+        startup.completing = False
     return False
 
 

@@ -12,8 +12,8 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,7 @@ from llvmlite.binding import ffi
 from numba.core.caching import IndexDataCacheFile
 from numba.core.lowering import BaseLower
 
-from specshield.policy.dqn.network import NAMES, Network, make_network
-from specshield.policy.dqn.observation import observation_size
-from specshield.policy.dqn.policy import Policy
+from specshield.arrays import Floats
 from specshield.policy.lattice import Lattice
 from specshield.policy.progress import make_rules
 from specshield.policy.reachability.around.field import distances, goal_cells
@@ -38,6 +36,7 @@ from specshield.service.storage.keeper import at_end_of_input
 from specshield.shield import episode, shaping
 from specshield.shield.caution.experience import was_stopped
 from specshield.shield.decision import Config, make_shield
+from specshield.shield.proposal import Proposal
 from specshield.shield.surprise.contact import cells_met
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task, make_task
@@ -49,7 +48,7 @@ REGIONS = {
     "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
     "C": {"type": "polygon", "vertices": [[1.2, 1.2], [2.0, 1.2], [2.0, 2.0]]},
 }
-START, AWAY = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8)  # in A and out of it
+START, AWAY, OFF = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8), (-9.0, 0.0, 0.0)  # in A, out of it, and off the map
 
 
 def warm_up(part: str) -> None:
@@ -62,14 +61,12 @@ def _propose() -> None:
     """The kernels by which reachability makes its tables and proposes. They take longest to compile."""
     policy = synthesise(task := _task())
     policy.propose(np.array([START]), {}, 0.0)
-    body = make_body(task.robot, task.grid)
-    for guess in (False, True):  # without a guess, known ways suffice; with one, ways are searched for
-        policy.on_body(body, guess).propose(np.array([START]), {}, 0.0)
+    policy.on_body(make_body(task.robot, task.grid)).propose(np.array([START]), {}, 0.01)
 
 
 def _decide() -> None:
-    """The kernels by which the shield begins sessions, decides and refuses, with a DQN as the proposer: with
-    an exact world, and with the defaults of a session.
+    """The kernels by which the shield begins sessions, decides and refuses: with an exact world, and with the
+    defaults of a session.
     """
     # First those that need no task, so that the other process compiles those of a task meanwhile. `sweep` is
     # one of the other's, which has more to compile.
@@ -82,7 +79,7 @@ def _decide() -> None:
     shaping.restrict(prior, ~STRETCH.terminal)
     packing.pack_table(np.zeros((len(logits), packing.COLUMNS)), logits)
     task = _task()
-    policy = Policy(task, {"id": "warm-up"}, _network(task))
+    policy = _Standing(task)
     for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
         shield = make_shield([policy], config)
         episode.start(shield, START)
@@ -94,9 +91,26 @@ def _decide() -> None:
     refusal(shield, np.array([START]), {})
     _in_trouble(policy, logits)
     distances(shield.body, goal_cells(shield.body, make_rules(task)))
+    # The search for ways around is reachability's too. By now the other process has compiled what it calls.
+    # Off the map it gives up soon.
+    synthesise(task).on_body(shield.body, True).propose(np.array([OFF]), {}, 0.0)
 
 
-def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
+@dataclass(frozen=True)
+class _Standing:
+    """A policy that has no kernels: it waits after each motion."""
+
+    task: Task
+    id = "standing"
+
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
+        robot = self.task.robot
+        motions = np.full((len(robot.motions), self.task.horizon + 1 - len(history)), robot.wait_motion)
+        motions[:, 0] = np.arange(len(motions))
+        return Proposal(motions, robot.wait_motion)
+
+
+def _in_trouble(policy: _Standing, logits: np.ndarray) -> None:
     """The kernels for a robot in trouble: walled in, where it must not be, or stopped by something unknown.
     And those for a threshold below 1.
     """
@@ -133,22 +147,31 @@ def _plan() -> None:
     planner.synthesise(_task()).propose(np.array([START]), {}, 0.0)
 
 
-PARTS: dict[str, Callable[[], None]] = {"reachability": _propose, "shield and dqn": _decide}
-LATER: dict[str, Callable[[], None]] = {"rarer decisions": _decide_rarely, "planner": _plan}
+def _roll_out() -> None:
+    """The kernels of a DQN."""
+    from specshield.policy.dqn.network import NAMES, make_network
+    from specshield.policy.dqn.observation import observation_size
+    from specshield.policy.dqn.policy import Policy
+
+    task = _task()
+    body = make_body(task.robot, task.grid)
+    inputs, outputs = observation_size(make_rules(task), body), motion_count(body)
+    shapes = ((inputs, 4), 4, (4, 4), 4, (4, outputs), outputs)
+    weights = {name: np.zeros(shape, np.float32) for name, shape in zip(NAMES, shapes, strict=True)}
+    network = make_network(weights, inputs, outputs)
+    Policy(task, {"id": "warm-up"}, network).propose(np.array([START]), {}, 0.0)
+
+
+PARTS: dict[str, Callable[[], None]] = {"reachability": _propose, "shield": _decide}
+LATER: dict[str, Callable[[], None]] = {
+    "dqn": _roll_out, "rarer decisions": _decide_rarely, "planner": _plan,
+}  # fmt: skip
 
 
 def _task(**regions: dict[str, Any]) -> Task:
     """A task in which every cell can be reached: other tasks import scipy, which takes 0.2 s."""
     small, empty = replace(STRETCH, radius=0.01), OccupancyGrid(np.zeros((20, 20), bool), 0.1)
     return make_task(empty, small, FORMULA, {**REGIONS, **regions})
-
-
-def _network(task: Task) -> Network:
-    body = make_body(task.robot, task.grid)
-    inputs, outputs = observation_size(make_rules(task), body), motion_count(body)
-    shapes = ((inputs, 4), 4, (4, 4), 4, (4, outputs), outputs)
-    weights = {name: np.zeros(shape, np.float32) for name, shape in zip(NAMES, shapes, strict=True)}
-    return make_network(weights, inputs, outputs)
 
 
 def _keep_all() -> None:

@@ -64,10 +64,16 @@ class Sessions:
     """
 
     def __init__(
-        self, settings: Settings, store: ArchivingStore, policies: Policies, heavy: Heavy, tell: Tell
+        self,
+        settings: Settings,
+        store: ArchivingStore,
+        policies: Policies,
+        heavy: Heavy,
+        tell: Tell,
+        is_compiled: Callable[[str], bool],
     ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
-        self._shields = Shields(policies, settings.shield_cache)
+        self._shields = Shields(policies, settings.shield_cache, is_compiled)
         self._threads = ThreadPoolExecutor(cores(), "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, self._shields, self._run, heavy, settings)

@@ -35,8 +35,14 @@ class Shields:
     decision waits for it.
     """
 
-    def __init__(self, policies: Policies, room: int) -> None:
-        self.policies, self._shields = policies, files.Recent[Shield](room)
+    def __init__(
+        self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda method: True
+    ) -> None:
+        """room: for so many shields. is_compiled: whether a method's kernels are there, so that its decisions
+        need not compile them (warmup.LATER).
+        """
+        self.policies, self._is_compiled = policies, is_compiled
+        self._shields = files.Recent[Shield](room)
         self._judges = files.Recent[Shield](room)  # shields without policies, for verdicts, by digest
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
@@ -50,9 +56,14 @@ class Shields:
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)
-        return self._slow.get(
-            key, lambda: any(self.policies.record(id).about.method not in QUICK for id in key)
-        )
+        slow = self._slow.peek(key)
+        if slow is None:
+            methods = [self.policies.record(id).about.method for id in key]
+            slow = any(method not in QUICK for method in methods)
+            if not slow and not all(map(self._is_compiled, methods)):
+                return True  # for now
+            self._slow.put(key, slow)
+        return slow
 
     def note_slow(self, session: Session) -> None:
         """From now on the decisions of sessions with these policies count as slow."""
