@@ -67,7 +67,8 @@ def leaf(function: F) -> F:
 
     At each call numba counts a reference to each array of a struct, with atomic operations that take most of
     a rollout's time. A function that allocates nothing needs no counting. The option for that is not in
-    numba's manual; without it, the kernels do the same, more slowly.
+    numba's manual; without it, the kernels do the same, more slowly. Such a function must not return a struct
+    of arrays, since its caller would give back references that were never counted.
     """
     return _leaf(function)
 

@@ -137,9 +137,9 @@ def test_what_is_open_has_the_robustness_that_its_definition_says(rule, early):
         walk = np.abs(np.cumsum(random.normal(0.0, 0.15, (9, task.horizon + 1, 3)), axis=1))
         walk[:, : t + 1] = walk[0, : t + 1]
         prefix = prefix_of(task, formula, view, walk[0, : t + 1], {})
-        rho, leaves = np.empty(9), np.empty((9, view.tree.size))
+        rho, leaves = np.empty(9), np.empty((9, view.value.tree.size))
         rate(view, prefix.known, t, np.ascontiguousarray(walk[:, t + 1 :]), np.empty((1, 0)), rho, leaves)
-        still, found = np.empty(len(parts.kind), np.bool_), np.empty(9)
+        still, found = np.empty(len(parts.value.kind), np.bool_), np.empty(9)
         settled = np.empty(len(still))
         find_open(parts, prefix.known, t, np.full(len(still), SATISFIED_ABOVE), still, settled)
         assert (settled == SATISFIED_ABOVE).all()
@@ -195,9 +195,13 @@ def test_a_visit_behind_has_to_have_the_margin_as_long_as_another_can(rule):
         walk = np.abs(np.cumsum(random.normal(0.0, 0.15, (9, task.horizon + 1, 3)), axis=1))
         walk[:, : t + 1] = walk[0, : t + 1]
         prefix = prefix_of(task, formula, view, walk[0, : t + 1], {})
-        rho, leaves = np.empty(9), np.empty((9, view.tree.size))
+        rho, leaves = np.empty(9), np.empty((9, view.value.tree.size))
         rate(view, prefix.known, t, np.ascontiguousarray(walk[:, t + 1 :]), np.empty((1, 0)), rho, leaves)
-        still, settled, found = np.empty(len(parts.kind), np.bool_), np.empty(len(parts.kind)), np.empty(9)
+        still, settled, found = (
+            np.empty(len(parts.value.kind), np.bool_),
+            np.empty(len(parts.value.kind)),
+            np.empty(9),
+        )
         find_open(parts, prefix.known, t, np.full(len(still), MARGIN), still, settled)
         rate_open(parts, still, t, settled, np.zeros(len(still), np.int64), leaves, found)
         samples, least = task.samples(walk), []

@@ -32,5 +32,5 @@ def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats) -> For
 def bounds_after(task: Task, formula: Formula, poses: Floats, rows: Floats) -> tuple[float, float]:
     """Bounds (lo, hi) on rho of the formula, or of a part of it, after x_{0:t}."""
     view = view_of(task, formula)
-    low, high = look(view, poses, rows, np.empty(view.tree.size))
+    low, high = look(view, poses, rows, np.empty(view.value.tree.size))
     return float(low), float(high)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
+from specshield.boxed import Boxed, box
 from specshield.compiled import kernel, leaf
 from specshield.rule.residual import all_of
 from specshield.rule.values import places
@@ -53,7 +54,7 @@ class Conjuncts(NamedTuple):
 
 
 @kept_with_task
-def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts]:
+def conjunction_of(task: Task, formula: Formula) -> tuple[Boxed[View] | None, Boxed[Conjuncts]]:
     """The formula's conjuncts, and the view that has their leaves; None if that is the formula's own view."""
     above = (formula,) if is_predicate(formula) else conjuncts(formula)  # as in the tree
     above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
@@ -79,8 +80,8 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:8]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
     parts = Conjuncts._make((below, *columns, plain, *(np.array(of, np.int64) for of in (owner, seeker))))
-    same = whole == formula and tree.size == view_of(task, formula).tree.size  # no window is far
-    return None if same else view_of(task, whole, True), parts
+    same = whole == formula and tree.size == view_of(task, formula).value.tree.size  # no window is far
+    return None if same else view_of(task, whole, True), box(parts)
 
 
 def _is_plain(part: Formula) -> bool:
@@ -90,7 +91,7 @@ def _is_plain(part: Formula) -> bool:
 
 @kernel
 def find_open(
-    parts: Conjuncts, known: Floats, t: int, visits: Floats, still: Bools, settled: Floats
+    boxed: Boxed[Conjuncts], known: Floats, t: int, visits: Floats, still: Bools, settled: Floats
 ) -> Floats:
     """Writes into still (K,) which conjuncts x_{0:t} has not settled, and into settled (K,) above which
     robustness past visits count for each conjunct. Returns the lower bounds of all nodes, (size,).
@@ -98,7 +99,7 @@ def find_open(
     known (size,): the leaves to step t. visits (K,): the robustness above which past visits are to count; a
     conjunct that can no longer be so robust counts every visit.
     """
-    low, high = known.copy(), known.copy()
+    parts, low, high = boxed.value, known.copy(), known.copy()
     bounds_at(parts.below, t, low, high)
     for k in range(settled.shape[0]):
         had = _value(parts, k, parts.a[k], parts.b[k], high) > visits[k]
@@ -134,7 +135,7 @@ def _settle(parts: Conjuncts, t: int, settled: Floats, buffer: Floats) -> bool:
 
 @kernel
 def rate_open(
-    parts: Conjuncts, still: Bools, t: int, settled: Floats, early: Ints, leaves: Floats, rho: Floats
+    boxed: Boxed[Conjuncts], still: Bools, t: int, settled: Floats, early: Ints, leaves: Floats, rho: Floats
 ) -> None:
     """Writes rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before
     its end, though a window keeps at least half its length; what a window that is far asks for has to hold as
@@ -142,7 +143,8 @@ def rate_open(
 
     settled (K,): see `find_open`. leaves (N, size): the leaves along N trajectories.
     """
-    buffer, scratch, some = np.empty(leaves.shape[1]), np.empty(leaves.shape[1]), still.any()
+    parts, some = boxed.value, still.any()
+    buffer, scratch = np.empty(leaves.shape[1]), np.empty(leaves.shape[1])
     for f in range(leaves.shape[0]):
         copy_row(leaves[f], buffer)
         if some:

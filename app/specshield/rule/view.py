@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
+from specshield.boxed import Boxed, box
 from specshield.compiled import inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Always, And, Formula, Node, Until
@@ -34,7 +35,7 @@ class View(NamedTuple):
 
 
 @kept_with_task
-def view_of(task: Task, formula: Formula, ahead: bool = False) -> View:
+def view_of(task: Task, formula: Formula, ahead: bool = False) -> Boxed[View]:
     """The formula, or a part of it, prepared once. ahead: see `compile_tree`; no leaf binds then."""
     names = list(task.areas)
     tree = compile_tree(formula, places(task), ahead)
@@ -46,7 +47,8 @@ def view_of(task: Task, formula: Formula, ahead: bool = False) -> View:
             r = int(place) - REGIONS
             if 0 <= r < len(names):
                 first[r], last[r] = min(first[r], tree.leaf_start[n]), max(last[r], tree.leaf_stop[n] - 1)
-    return View(tree, regions_of(task), first, last, np.array(list(_binding(formula, not ahead)), np.bool_))
+    binds = np.array(list(_binding(formula, not ahead)), np.bool_)
+    return box(View(tree, regions_of(task), first, last, binds))
 
 
 def _binding(formula: Node, binds: bool) -> Iterator[bool]:
@@ -124,11 +126,12 @@ def _read(
 
 
 @kernel
-def look(view: View, poses: Floats, signals: Floats, known: Floats) -> tuple[float, float]:
+def look(boxed: Boxed[View], poses: Floats, signals: Floats, known: Floats) -> tuple[float, float]:
     """Bounds (lo, hi) on rho after x_{0:t}; NaN where the formula's arithmetic is not finite on it.
 
     poses (t + 1, 3), signals (t + 1, S). known (tree.size,): the leaves at the steps to t are written there.
     """
+    view = boxed.value
     values = np.empty(value_count(view, signals))
     if not _read(view, poses, signals, 0, values, np.empty(STACK_SIZE), known):
         return math.nan, math.nan
@@ -146,13 +149,15 @@ def recall_prefix(view: View, known: Floats, t: int, buffer: Floats) -> None:
 
 
 @kernel
-def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Floats, leaves: Floats) -> None:
+def rate(
+    boxed: Boxed[View], known: Floats, t: int, poses: Floats, held: Floats, rho: Floats, leaves: Floats
+) -> None:
     """rho (N,) of the futures poses (N, T - t, 3) of the prefix that `look` left in `known`; NaN as there.
 
     held (1, S): the values that the signals keep from step t + 1 on. leaves (N, tree.size) are written.
     """
-    tree = view.tree
-    values = np.empty(value_count(view, held))
+    view = boxed.value
+    tree, values = view.tree, np.empty(value_count(view, held))
     stack, buffer = np.empty(STACK_SIZE), np.empty(tree.size)
     for f in range(poses.shape[0]):
         recall_prefix(view, known, t, buffer)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from specshield.arrays import Floats
+from specshield.boxed import Boxed
 from specshield.errors import InputError, PolicyError
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of
@@ -84,7 +85,7 @@ class Shield:
     proposers: tuple[Proposer, ...]
     config: Config
     body: Body = field(repr=False)
-    view: View = field(repr=False)
+    view: Boxed[View] = field(repr=False)
     preference: Preference | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:

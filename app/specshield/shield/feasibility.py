@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
+from specshield.boxed import Boxed
 from specshield.compiled import inlined, kernel
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.values import signal_rows
@@ -32,8 +33,9 @@ NOT_FINITE = "the formula's arithmetic is not finite along some futures; these c
 class Prefix(NamedTuple):
     """What was driven, and what it says of a formula: rho lies in [low, high] however the robot goes on.
 
-    poses [t + 1, 3], t = len(poses) - 1; signals {name: [at most t + 1]}; rows [t + 1, S]: the signals as an
-    array. held [1, S]: the values that the signals are taken to have from step t + 1 on.
+    poses [t + 1, 3]; steps: how many motions a future has, T - t. signals {name: [at most t + 1]}; rows
+    [t + 1, S]: the signals as an array. held [1, S]: the values that the signals are taken to have from step
+    t + 1 on.
     """
 
     task: Task
@@ -41,22 +43,15 @@ class Prefix(NamedTuple):
     poses: Floats
     signals: Signals
     rows: Floats
-    view: View
+    view: Boxed[View]
     known: Floats  # the formula's leaves at the steps to t
     low: float
     high: float
     held: Floats
+    t: int
+    steps: int
 
-    @property
-    def t(self) -> int:
-        return len(self.poses) - 1
-
-    @property
-    def steps(self) -> int:
-        """How many motions a future has: T - t."""
-        return self.task.horizon - self.t
-
-    def of(self, formula: Formula, view: View | None = None) -> Prefix:
+    def of(self, formula: Formula, view: Boxed[View] | None = None) -> Prefix:
         """The same prefix for another formula, a part of the task's own; view: that of the formula."""
         view = view or view_of(self.task, formula)
         seen = prefix_of(self.task, formula, view, self.poses, self.signals)
@@ -66,7 +61,7 @@ class Prefix(NamedTuple):
         """Whether the formula can still be kept if the next pose is this one (3,). False where its arithmetic
         is not finite there.
         """
-        poses, known = np.concatenate([self.poses, pose[None]]), np.empty(self.view.tree.size)
+        poses, known = np.concatenate([self.poses, pose[None]]), np.empty(self.view.value.tree.size)
         _, high = look(self.view, poses, signal_rows(self.task, self.foreseen, len(poses)), known)
         return bool(high > SATISFIED_ABOVE)
 
@@ -77,18 +72,19 @@ class Prefix(NamedTuple):
         return {name: rows[:, i] for i, name in enumerate(self.task.signals)}
 
 
-def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: Signals) -> Prefix:
+def prefix_of(task: Task, formula: Formula, view: Boxed[View], poses: Floats, signals: Signals) -> Prefix:
     """The prefix for `formula`, which is the task's own or a part of it; view: that of the formula.
 
     Raises SampleError where the formula's arithmetic is not finite on it.
     """
     rows = signal_rows(task, signals, len(poses))
-    known = np.empty(view.tree.size)
+    known = np.empty(view.value.tree.size)
     low, high = look(view, poses, rows, known)
     if low != low:
         samples = task.samples(poses, signals)
         robustness_bounds(formula, {name: samples[name] for name in formula.names})  # says what and where
-    return Prefix(task, formula, poses, signals, rows, view, known, low, high, rows[-1:])
+    t, held = len(poses) - 1, rows[-1:]
+    return Prefix(task, formula, poses, signals, rows, view, known, low, high, held, t, task.horizon - t)
 
 
 class Futures(NamedTuple):
@@ -139,10 +135,10 @@ def futures(
 def simulated(
     prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
 ) -> Futures:
-    """The futures of motions, rows of arrays [n, T - t] that are in range: simulated and judged at once."""
-    motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows])
+    """The futures of motions, one or more arrays [n, T - t] in range: simulated and judged at once."""
+    motions = np.concatenate(rows)
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
-    leaves = np.empty((len(motions), prefix.view.tree.size))
+    leaves = np.empty((len(motions), prefix.view.value.tree.size))
     violated = prefix.high <= SATISFIED_ABOVE  # then parts of the rule are judged, on every row as a whole
     known = prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.held
     wait, written = prefix.task.robot.wait_motion, (motions, poses, rho, leaves)
@@ -160,7 +156,7 @@ def together(tried: Futures, more: Futures) -> Futures:
 
 def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:
     """rho (N,) of the prefix's formula along futures, poses [N, T - t, 3], and its leaves (N, size)."""
-    values, leaves = np.empty(len(poses)), np.empty((len(poses), prefix.view.tree.size))
+    values, leaves = np.empty(len(poses)), np.empty((len(poses), prefix.view.value.tree.size))
     rate(prefix.view, prefix.known, prefix.t, poses, prefix.held, values, leaves)
     return np.where(np.isnan(values), -np.inf, values), leaves
 
@@ -168,7 +164,7 @@ def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:
 @kernel
 def _simulate_and_rate(
     body: Body,
-    view: View,
+    boxed: Boxed[View],
     known: Floats,
     t: int,
     pose: Floats,
@@ -189,6 +185,7 @@ def _simulate_and_rate(
     where the formula can no longer be satisfied on it and an earlier row of its first motion is at least as
     robust: rho is then -inf, and the poses that follow repeat the last.
     """
+    view = boxed.value
     tree, steps, finite = view.tree, motions.shape[1], True
     values, stack, buffer = np.empty(value_count(view, held)), np.empty(STACK_SIZE), np.empty(tree.size)
     best = np.full(motion_count(body), -np.inf)

@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from specshield.arrays import Floats, Ints
+from specshield.compiled import leaf
 from specshield.task import Task
 
 MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
@@ -101,6 +102,17 @@ def ask(
     return found, None
 
 
+@leaf
+def _out_of_range(motions: Ints, count: int) -> int:
+    """The first entry (of rows that follow one another) that is not from 0 to count - 1; -1 if all are."""
+    rows, steps = motions.shape
+    for n in range(rows):
+        for i in range(steps):
+            if not 0 <= motions[n, i] < count:
+                return int(n * steps + i)
+    return -1
+
+
 def _checked(given: object, count: int, steps: int, least: int) -> Proposal | str:
     """A copy of a proposal, or what is wrong with it."""
     if not isinstance(given, Proposal):
@@ -112,9 +124,8 @@ def _checked(given: object, count: int, steps: int, least: int) -> Proposal | st
         rows = f"N from {least} to {MAX_MOTIONS // steps}"
         return f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], {rows}"
     own = np.array(motions, np.int64, order="C")
-    wrong = own[(own < 0) | (own >= count)]
-    if len(wrong):
-        return f"it names motion {wrong[0]}; the robot has motions 0 to {count - 1}"
+    if (wrong := _out_of_range(own, count)) >= 0:
+        return f"it names motion {own.flat[wrong]}; the robot has motions 0 to {count - 1}"
     whole = isinstance(preferred, (int, np.integer)) and not isinstance(preferred, bool)
     if not (whole and 0 <= preferred < count):
         return f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}"

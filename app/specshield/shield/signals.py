@@ -47,8 +47,9 @@ def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation
     if broken and recovers(shield.config):
         said = (*judged.tried.warnings, *given_up(other))
         judged = judged._replace(tried=judged.tried._replace(warnings=said))
-    values = judged.values if broken else np.minimum(judged.values, least)
-    judged = judged._replace(values=values, robustness=np.minimum(judged.robustness, least))
+    if least < np.inf:
+        values = judged.values if broken else np.minimum(judged.values, least)
+        judged = judged._replace(values=values, robustness=np.minimum(judged.robustness, least))
     return shield, now, judged, found is not None and sure
 
 

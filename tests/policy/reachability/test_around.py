@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specshield.boxed import box
 from specshield.policy.progress import PENDING, SETTLED, make_rules
 from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells, spare_on
@@ -191,16 +192,16 @@ def test_no_pose_is_tried_where_distances_show_that_a_goal_cannot_be_reached_in_
     occupied[25:, 20] = shut > 0
     body = make_body(task.robot, replace(task.grid, occupied=occupied))
     rules, wait = make_rules(task), task.robot.wait_motion
-    guide = Guide(body, rules, synthesise(task).tables, wait, NOTHING_BARRED)
+    guide = box(Guide(body, rules, synthesise(task).tables, wait, NOTHING_BARRED))
     fields = distances(body, goal_cells(body, rules))
     past = pasts(rules, np.array([[0.7, 1.5, 0.0]]), np.empty((1, 0)))[0]
     motions = np.empty((len(task.robot.motions), due), np.int64)
     poses = np.empty((*motions.shape, 3))
     most = POSES if found else 32  # enough for what is found; else it gives up
-    assert (go_around(guide, past, fields, poses, motions, most) >= 0) == found
+    assert (go_around(guide, 0.0, past, fields, poses, motions, most) >= 0) == found
     if not found:
-        assert go_around(guide, past, fields, poses, motions, most) == NO_WAY
-        assert go_around(guide, past, NO_FIELDS, poses, motions, most) == GAVE_UP
+        assert go_around(guide, 0.0, past, fields, poses, motions, most) == NO_WAY
+        assert go_around(guide, 0.0, past, NO_FIELDS, poses, motions, most) == GAVE_UP
 
 
 @pytest.mark.parametrize(
@@ -216,8 +217,8 @@ def test_a_search_is_not_bounded_by_distances_to_goals_that_the_centres_of_free_
     known, body = two_rooms("F[0,60] East")
     task = make_task(known.grid, STRETCH, rule, {"Wall": goal, "Spot": goal, "Shelf": shelf})
     rules = make_rules(task)
-    guide = Guide(body, rules, synthesise(task).tables, task.robot.wait_motion, NOTHING_BARRED)
+    guide = box(Guide(body, rules, synthesise(task).tables, task.robot.wait_motion, NOTHING_BARRED))
     past = pasts(rules, np.array([[0.7, 1.5, 0.0]]), np.empty((1, 0)))[0]
     motions = np.empty((len(task.robot.motions), 40), np.int64)
     fields, poses = distances(body, goal_cells(body, rules)), np.empty((*motions.shape, 3))
-    assert go_around(guide, past, fields, poses, motions, POSES) != NO_WAY
+    assert go_around(guide, 0.0, past, fields, poses, motions, POSES) != NO_WAY

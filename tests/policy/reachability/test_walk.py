@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specshield.boxed import box
 from specshield.policy.lattice import STEP_CODES
 from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.policy.progress.recall import Past
@@ -160,9 +161,13 @@ def test_a_beam_gives_up_what_comes_too_late(visit):
     assert taken.tolist() == [0]
 
 
+def past_at(cell):
+    return Past(0.0, pose(cell)[None], np.empty((1, 0)))
+
+
 def test_a_continuation_after_each_first_motion(visit):
     motions, poses = np.empty((4, 10), np.int64), np.empty((4, 10, 3))
-    best = continue_all(visit, 12, Past(0.0, pose(0)[None], np.empty((1, 0))), *every(4), motions, poses)
+    best = continue_all(box(visit), 0.0, 12, past_at(0), *every(4), motions, poses)
     assert best == FORWARD
     assert motions[:, 0].tolist() == [FORWARD, LEFT, RIGHT, WAIT]
     np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])  # five cells in at most ten steps, after each
@@ -173,7 +178,7 @@ def test_a_robot_that_cannot_wait_is_there_at_the_one_step_asked_for():
     guide = guide_of(make_corridor("F[4,4] A", RESTLESS, A=5))
     assert guide.wait == -1
     motions, poses = np.empty((3, 4), np.int64), np.empty((3, 4, 3))
-    continue_all(guide, 12, Past(0.0, pose(3)[None], np.empty((1, 0))), *every(3), motions, poses)
+    continue_all(box(guide), 0.0, 12, past_at(3), *every(3), motions, poses)
     np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])
     assert sorted(motions[1].tolist()) == [FORWARD, FORWARD, LEFT, RIGHT]
 

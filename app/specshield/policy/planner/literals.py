@@ -62,7 +62,7 @@ class PackedLiterals(NamedTuple):
 def literals_of(task: Task, formula: Formula) -> tuple[PackedLiterals, tuple[Literal, ...]]:
     """The literals of the task's formula or of a part of it, in the order of `PackedLiterals.literal`."""
     formula = separate(task, formula)
-    view = view_of(task, formula)
+    view = view_of(task, formula).value
     predicates: list[Formula] = []
     literals: dict[tuple[int, int], Literal] = {}
     leaves: list[tuple[int, int]] = []

@@ -21,6 +21,7 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Codes, Floats, Int32s
+from specshield.boxed import box
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
@@ -148,7 +149,7 @@ class PlannerPolicy(Carded):
         """
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         formula = self._world.literals.formula
-        _, high = look(formula, history, rows, np.empty(formula.tree.size))
+        _, high = look(box(formula), history, rows, np.empty(formula.tree.size))
         whole = self.rest or moved(self.task)[0]
         parts: Iterable[Formula] = (whole,)
         if high <= SATISFIED_ABOVE:
@@ -190,7 +191,7 @@ class PlannerPolicy(Carded):
         t = len(history) - 1
         literals = world.literals._replace(margin=margin)
         known = np.empty(literals.formula.tree.size)
-        look(literals.formula, history, rows, known)
+        look(box(literals.formula), history, rows, known)
         motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
         effort = self.share * self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals, barred=self._world.barred)

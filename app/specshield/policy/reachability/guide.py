@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
+from specshield.boxed import Boxed
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Corners
 from specshield.policy.progress import (
@@ -102,7 +103,7 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
         copy_row(poses[n - 1], poses[rest])
 
 
-def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
+def hurried(guide: Guide, margin: float, early: int, past: Past) -> tuple[Guide, bool]:
     """The guide for deadlines that come `early` steps earlier, and whether any does: those of each F that is
     open at step t and can still be met so early. A window keeps at least half its length. For a robot that
     cannot wait, no deadline comes earlier.
@@ -110,7 +111,8 @@ def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
     if guide.wait < 0:
         return guide, False
     rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
-    least, sooner = _hasten(guide.rules, early, past, rules.b, rules.c1)
+    now = Rules(*guide.rules[:-2], guide.rules.signals.copy(), margin)
+    least, sooner = _hasten(now, early, past, rules.b, rules.c1)
     return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), sooner
 
 
@@ -135,9 +137,10 @@ def _hasten(rules: Rules, early: int, past: Past, b: Ints, c1: Ints) -> tuple[in
 
 
 @kernel
-def share_with_slack(guide: Guide, poses: Floats) -> float:
+def share_with_slack(boxed: Boxed[Guide], poses: Floats) -> float:
     """The share of the poses (N, 3) from which the tables leave time enough at the first step."""
-    found, scratch = 0, make_scratch(guide.rules, 1)
+    guide, found = boxed.value, 0
+    scratch = make_scratch(guide.rules, 1)
     for n in range(poses.shape[0]):
         x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
         scratch.status[:], scratch.run[:] = PENDING, 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
+from specshield.boxed import Boxed
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways
 from specshield.policy.progress import SETTLED
@@ -17,7 +18,15 @@ from specshield.policy.progress.recall import Past
 from specshield.policy.reachability.finish import Search, finish
 from specshield.policy.reachability.guide import copy_progress, fill, update_progress
 from specshield.policy.reachability.search import begin, go_back, join_sibling, take
-from specshield.policy.reachability.tables import HOPELESS, Guide, Scratch, is_broken, settled_goals, slack
+from specshield.policy.reachability.tables import (
+    HOPELESS,
+    Guide,
+    Scratch,
+    guided,
+    is_broken,
+    settled_goals,
+    slack,
+)
 from specshield.policy.reachability.walk import CLIMB_GAIN, SETTLED_ALL, STUCK, climb
 
 # Searches for one way, each tried where those before it failed. Columns: how many steps before the robot is
@@ -34,7 +43,8 @@ MAX_LEGS = 16  # searches on one way
 
 @kernel
 def continue_narrow(
-    guide: Guide,
+    boxed: Boxed[Guide],
+    margin: float,
     narrow: Bools,
     top: Floats,
     effort: Floats,
@@ -46,9 +56,11 @@ def continue_narrow(
 ) -> int:
     """`continue_all` for a rule with narrow predicates: those of the obligations `narrow` (K,).
 
-    top [tables]: the latest feasible time of each table [steps]. effort [searches, 4]: for the way from x_t.
-    The other arguments are those of `continue_all`. The robot has to be one that can wait.
+    margin: what the rules ask for [m]. top [tables]: the latest feasible time of each table [steps]. effort
+    [searches, 4]: for the way from x_t. The other arguments are those of `continue_all`. The robot has to be
+    one that can wait.
     """
+    guide = guided(boxed, margin)
     starts, scratch = begin(guide, past, wanted, motions, poses)
     now, order, twin, settled = starts.now, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Bools, Floats
+from specshield.boxed import Boxed, box
 from specshield.errors import MapError, PolicyError, SampleError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses
@@ -128,6 +129,10 @@ class ReachabilityPolicy(Carded):
         """The distances to the goals on the maps that were last used: a map changes seldom."""
         return deque(maxlen=max(2, min(MAPS, MAPS_BYTES // self._body.clearance.nbytes)))
 
+    @cached_property
+    def _guide(self) -> Boxed[Guide]:
+        return box(Guide(self._body, self._rules, self.tables, self.task.robot.wait_motion, self.barred))
+
     @property
     def _fields(self) -> Floats:
         key = id(self._body.clearance), self._body.radius
@@ -156,34 +161,36 @@ class ReachabilityPolicy(Carded):
         self, history: Floats, signals: Mapping[str, Floats], margin: float, effort: Floats
     ) -> Proposal:
         """effort: of the search for narrow predicates."""
-        rules = self._rules._replace(signals=self._rules.signals.copy(), margin=margin)
+        rules = Rules(*self._rules[:-2], self._rules.signals.copy(), margin)
         read = moved(self.task)[0].names  # what the rule asks of other signals, no motion changes
         rows = signal_rows(self.task, {name: signals[name] for name in read if name in signals}, len(history))
         shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
         chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
         proposals = []
         for past in pasts(rules, history, rows):
-            guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
+            guide, waits = self._guide, self._guide.value.wait >= 0
             if self.wanted is not None:
-                guide, sooner = hurried(guide, self.early, past)
+                earlier, sooner = hurried(guide.value, margin, self.early, past)
                 if not sooner:
                     continue
+                guide = box(earlier)
             motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
             wanted = np.array([not self.brief] * shape[0] if self.wanted is None else self.wanted)
             around = NO_WAY
             if self.guess:
-                fields = self._fields if guide.wait < 0 else NO_FIELDS
-                around = go_around(guide, past, fields, poses, ways, FEWER)
+                fields = NO_FIELDS if waits else self._fields
+                around = go_around(guide, margin, past, fields, poses, ways, FEWER)
             if around == GAVE_UP:
                 still = calmest_motion(self._body)
                 ways[:], ways[:, 0] = still, np.arange(len(ways))
                 proposals.append(Proposal(ways, still))
                 continue
-            if guide.wait >= 0 and True in self.narrow.tolist():
+            if waits and True in self.narrow.tolist():
                 of_narrow = self.narrow, self._top, effort
-                preferred = continue_narrow(guide, *of_narrow, past, wanted, least, motions, poses)
+                preferred = continue_narrow(guide, margin, *of_narrow, past, wanted, least, motions, poses)
             else:
-                preferred = continue_all(guide, self.settings.beam, past, wanted, least, motions, poses)
+                beam = self.settings.beam
+                preferred = continue_all(guide, margin, beam, past, wanted, least, motions, poses)
             if self.brief:
                 chosen = slice(preferred, preferred + 1)  # nothing was written of the others
             if preferred >= 0:
@@ -191,9 +198,9 @@ class ReachabilityPolicy(Carded):
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 vain = in_vain(self.barred, history[-1], motions[chosen], poses[chosen], True)
                 free = poses[chosen][~vain]
-                if not is_known(guide, past, free):
+                if not is_known(guide, margin, past, free):
                     most = FEWER if self.brief else POSES
-                    around = go_around(guide, past, self._fields, poses, ways, most)
+                    around = go_around(guide, margin, past, self._fields, poses, ways, most)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals or [Proposal(np.empty((0, shape[1]), np.int64), 0)])
@@ -214,8 +221,7 @@ class ReachabilityPolicy(Carded):
         except MapError:  # next to no free space
             return 0.0
         if not exact:
-            guide = Guide(body, rules, self.tables, self.task.robot.wait_motion, self.barred)
-            return share_with_slack(guide, poses)
+            return share_with_slack(self._guide, poses)
         return sum(self._keeps(pose) for pose in poses) / len(poses)
 
     def _keeps(self, pose: Floats) -> bool:

@@ -14,12 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
+from specshield.boxed import Boxed
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
 from specshield.policy.progress.recall import Past, Present, resume
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, beam_search
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
-from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, slack
+from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, guided, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.dynamics import displacement, motion_count, simulate, step
@@ -105,15 +106,23 @@ def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats)
 
 @kernel
 def continue_all(
-    guide: Guide, width: int, past: Past, wanted: Bools, lowest: float, motions: Ints, poses: Floats
+    boxed: Boxed[Guide],
+    margin: float,
+    width: int,
+    past: Past,
+    wanted: Bools,
+    lowest: float,
+    motions: Ints,
+    poses: Floats,
 ) -> int:
     """Writes a continuation after each `wanted` (M,) first motion into motions (M, T - t), and where it leads
     into poses (M, T - t, 3); returns the motion of most slack. -1, and nothing is written, where none that is
     wanted has a slack of at least `lowest` [steps]; no beam looks for a way after one that has less.
 
-    width: the poses that a beam keeps for each first motion. What is written of motions that are not wanted
-    need not be a way.
+    margin: what the rules ask for [m]. width: the poses that a beam keeps for each first motion. What is
+    written of motions that are not wanted need not be a way.
     """
+    guide = guided(boxed, margin)
     starts, scratch = begin(guide, past, wanted, motions, poses)
     t, order, twin, settled = starts.now.t, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints
-from specshield.compiled import inlined, leaf
+from specshield.boxed import Boxed
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import (
     INVALID,
     STEP_CODES,
@@ -63,6 +64,15 @@ class Guide(NamedTuple):
     tables: Tables
     wait: int
     barred: Floats
+
+
+@kernel
+def guided(boxed: Boxed[Guide], margin: float) -> Guide:
+    """The guide for one decision, by a margin [m], with signals of its own, which `replay` changes."""
+    body, rules, tables, wait, barred = boxed.value
+    kind, a, b, c1, c2, last, programs, regions, signals, _ = rules
+    rules = Rules(kind, a, b, c1, c2, last, programs, regions, signals.copy(), margin)
+    return Guide(body, rules, tables, wait, barred)
 
 
 class Scratch(NamedTuple):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
+from specshield.boxed import Boxed
 from specshield.compiled import kernel
 from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
@@ -63,25 +64,25 @@ def aim(
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
-    size, count = len(parts.kind), len(shield.task.robot.motions)
+    size, count = len(parts.value.kind), len(shield.task.robot.motions)
     still, short, settled = np.empty(size, np.bool_), np.empty(size, np.bool_), np.empty(size)
     asked, due = np.empty(size, np.int64), np.empty(size, np.int64)
     arrays = still, settled, asked, due, prefix.t, short, leaves, whole, tried.motions
-    now = Open(parts, *arrays, count, follows)
+    now = Open(*arrays, count, follows)
     if before is not None:
         find_open(parts, prefix.known, prefix.t, before.visits, still, settled)
         margin = min(care.margin, before.margin) + SATISFIED_ABOVE
-        best, _ = _best_open(now, before.early, margin)
+        best, _ = _best_open(parts, now, before.early, margin)
         return before._replace(best=best, kept=best.robustness > margin)
     any_visit = np.array([SATISFIED_ABOVE] * size)  # numpy is slow for so few
-    aimed = _aim(shield, care, prefix, now, any_visit, np.zeros(size, np.int64))
+    aimed = _aim(shield, care, prefix, parts, now, any_visit, np.zeros(size, np.int64))
     if True not in short.tolist():
         return aimed
     # Places that were visited with less than the margin are visited again, all of them or else each of which
     # that is possible with no less margin, and with half of the slack for all that is open beside it.
     places, half, robust = short.copy(), asked // 2, any_visit + care.margin
     for some in (places, *np.eye(size, dtype=np.bool_)[places]):
-        tighter = _aim(shield, care, prefix, now, np.where(some, robust, aimed.visits), half)
+        tighter = _aim(shield, care, prefix, parts, now, np.where(some, robust, aimed.visits), half)
         if tighter.margin >= aimed.margin and tighter.kept.any():
             aimed = tighter
             if some is places:
@@ -89,15 +90,23 @@ def aim(
     return aimed
 
 
-def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, sooner: Ints) -> Aimed:
+def _aim(
+    shield: Shield,
+    care: Care,
+    prefix: Prefix,
+    parts: Boxed[Conjuncts],
+    now: Open,
+    visits: Floats,
+    sooner: Ints,
+) -> Aimed:
     """`aim`, where a past visit counts if its robustness was above its conjunct's entry of `visits` (K,), and
     the slack is not lowered below `sooner` (K,).
     """
     margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
-    best, had = _best_asked(now, prefix.known, asking, visits, margin)
+    best, had = _best_asked(parts, now, prefix.known, asking, visits, margin)
     early = now.asked.copy()
     if not had:
-        best, had = _best_open(now, early := sooner, margin)
+        best, had = _best_open(parts, now, early := sooner, margin)
         if not had:  # there is no such margin either: ask for the largest that there is, and then for slack
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
         for of in (early >= 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
@@ -105,7 +114,7 @@ def _aim(shield: Shield, care: Care, prefix: Prefix, now: Open, visits: Floats, 
             while high - low > 1:
                 middle = (low + high) // 2
                 more = np.where(of, np.maximum(np.minimum(now.asked, middle), early), early)
-                tighter, had = _best_open(now, more, margin)
+                tighter, had = _best_open(parts, now, more, margin)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
     margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
@@ -122,7 +131,6 @@ class Open(NamedTuple):
     visit that lacks the margin and can be made again with it. motion_count: how many motions the robot has.
     """
 
-    parts: Conjuncts
     still: Bools
     settled: Floats
     asked: Ints
@@ -138,16 +146,22 @@ class Open(NamedTuple):
 
 @kernel
 def _best_asked(
-    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: Floats, margin: float
+    boxed: Boxed[Conjuncts],
+    now: Open,
+    known: Floats,
+    care: tuple[Noise, float, int, float],
+    visits: Floats,
+    margin: float,
 ) -> tuple[Best, bool]:
     """Fills in `still`, `settled`, `asked`, `due` and `short` of `now`, then returns `_best_open` for what is
     asked. care: noise, stride, least and chance of the `Care`. A window keeps at least half its length.
     """
-    (parts, still, settled, asked, due, t, short), (noise, stride, least, chance) = now[:7], care
-    find_open(parts, known, t, np.full(settled.shape[0], margin), still, settled)
+    (still, settled, asked, due, t, short), (noise, stride, least, chance) = now[:6], care
+    parts = boxed.value
+    find_open(boxed, known, t, np.full(settled.shape[0], margin), still, settled)
     for k in range(still.shape[0]):
         short[k] = settled[k] > SATISFIED_ABOVE and (parts.seeker == k).any()
-    low = find_open(parts, known, t, visits, still, settled)
+    low = find_open(boxed, known, t, visits, still, settled)
     for k in range(still.shape[0]):
         half, due[k], asked[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER, 0
         if still[k] and half > 0:
@@ -160,18 +174,18 @@ def _best_asked(
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
                 if not low[parts.at[k] - parts.a[k] + i] > settled[k]:
                     due[k] = min(due[k], i + parts.horizon[k] - t)
-    return _best_open(now, asked, margin)
+    return _best_open(boxed, now, asked, margin)
 
 
 @kernel
-def _best_open(now: Open, early: Ints, margin: float) -> tuple[Best, bool]:
+def _best_open(boxed: Boxed[Conjuncts], now: Open, early: Ints, margin: float) -> tuple[Best, bool]:
     """The best future of each motion, by the conjuncts that are open, and whether some rho is above `margin`.
 
     The way that the robot is on stays the best future of its motion if it is above the margin, even if
     another future is more robust: a robot that changes to a better way at each step may never arrive.
     """
     rho = np.empty(now.whole.shape[0])
-    rate_open(now.parts, now.still, now.t, now.settled, early, now.leaves, rho)
+    rate_open(boxed, now.still, now.t, now.settled, early, now.leaves, rho)
     rho[~(now.whole > SATISFIED_ABOVE)] = -np.inf
     best = best_of(now.motions, rho, now.motion_count)
     if now.follows and rho[0] > margin:

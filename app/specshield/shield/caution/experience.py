@@ -121,7 +121,7 @@ def _measures(task: Task) -> tuple[float, int]:
     conjunct that is no F, such as a patrol, has one deadline for each longest window in it.
     """
     longest = max((abs(move) for move, _ in task.robot.motions), default=0.0)
-    parts = conjunction_of(task, task.formula)[1]
+    parts = conjunction_of(task, task.formula)[1].value
     half = np.maximum(parts.half, parts.lead)
     windows = (parts.b + parts.horizon) // np.maximum(2 * half, 1) * (half > 0)
     return longest or 1.0, max(int(np.where(parts.kind == EVENTUALLY, 1, windows).sum()), 1)

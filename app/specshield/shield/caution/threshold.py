@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
+from specshield.boxed import Boxed
 from specshield.compiled import kernel, leaf
 from specshield.portable import inner
 from specshield.robot.body import Body, centre, displacement
@@ -50,7 +51,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # futures set aside do not count
-    still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
+    still, values = np.empty(len(parts.value.kind), np.bool_), np.zeros(len(task.robot.motions))
     any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
     find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
     blunt = all(abs(turn) >= SHARP for _, turn in task.robot.motions if turn != 0.0)
@@ -63,7 +64,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
 
 @kernel
 def _chances(
-    parts: Conjuncts,
+    boxed: Boxed[Conjuncts],
     still: Bools,
     t: int,
     robot: tuple[Body, bool],
@@ -78,7 +79,7 @@ def _chances(
     """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open. robot:
     its body, and whether it has no turn below SHARP. care: the noise, stride and margin of the `Care`.
     """
-    (body, blunt), (noise, stride, margin) = robot, care
+    parts, (body, blunt), (noise, stride, margin) = boxed.value, robot, care
     count, spread = still.shape[0], spread_of(noise, stride)
     sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))

@@ -17,6 +17,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
+from specshield.boxed import Boxed
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
@@ -38,6 +39,7 @@ from specshield.policy.reachability.tables import (
     Guide,
     Scratch,
     goals_settled,
+    guided,
     is_broken,
     slack_at,
 )
@@ -69,21 +71,24 @@ LEGS = 8  # searches for one way, each to the next goal
 
 
 @kernel
-def is_known(guide: Guide, past: Past, poses: Floats) -> bool:
+def is_known(boxed: Boxed[Guide], margin: float, past: Past, poses: Floats) -> bool:
     """Whether one of the ways poses (M, T - t, 3) settles every goal and breaks nothing."""
-    now, scratch = resume(guide.rules, past), make_scratch(guide.rules, 1)
+    rules = guided(boxed, margin).rules
+    now, scratch = resume(rules, past), make_scratch(rules, 1)
     for m in range(poses.shape[0]):
         copy_progress(now.status, now.run, scratch.status, scratch.run)
         for i in range(poses.shape[1]):
             x, y, theta = poses[m, i, 0], poses[m, i, 1], poses[m, i, 2]
-            update_progress(guide.rules, now.t + 1 + i, x, y, theta, scratch)
-        if goals_settled(guide.rules, scratch.status):
+            update_progress(rules, now.t + 1 + i, x, y, theta, scratch)
+        if goals_settled(rules, scratch.status):
             return True
     return False
 
 
 @kernel
-def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: Ints, most: int) -> int:
+def go_around(
+    boxed: Boxed[Guide], margin: float, past: Past, fields: Floats, poses: Floats, motions: Ints, most: int
+) -> int:
     """Searches for a way from x_t to every goal. Returns its first motion, else NO_WAY, or GAVE_UP if the
     search made `most` poses. Writes the way, and a way back onto it after each other motion, into motions
     (M, T - t).
@@ -91,7 +96,7 @@ def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: 
     fields [K, ny, nx]: the distances to the goals (field.py), or NO_FIELDS, which only a robot that can wait
     can do without. poses (M, T - t, 3): overwritten.
     """
-    count, steps = motions.shape
+    guide, (count, steps) = guided(boxed, margin), motions.shape
     starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
     now, t = starts.now, starts.now.t
     inside = overlap(guide.body, now.pose[0], now.pose[1], now.pose[2]) >= guide.body.radius
