@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -23,6 +24,7 @@ from specshield.service.heavy.uploads import policies_of
 from specshield.service.sessions.shields import Shields
 from specshield.service.settings import Settings
 from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, READY, Startup
+from specshield.shield.decision import Config
 from tests.serving import serving, wait_for
 
 
@@ -143,14 +145,18 @@ def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete
     assert list(incomplete.rglob("due_dates.make_bounds-*.nbi"))
 
 
-def test_decisions_of_a_dqn_are_made_elsewhere_until_its_kernels_are_compiled(tmp_path):
+def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_compiled(tmp_path):
     startup = Startup(completing=True)
     shields = Shields(policies_of(Settings(data_dir=tmp_path)), 10, startup.has)
     learned, computed = (shields.policies.find(name, "").id for name in ("case1-dqn", "case1"))
     assert shields.slow_policies([learned])
     assert not shields.slow_policies([computed])
-    startup.parts.append("dqn")
+    config = {"shaping": "projection", "policy_ids": [computed]}
+    session = SimpleNamespace(config=config, settings=Config(0.5))
+    assert shields.slow(session)
+    startup.parts += ["dqn", "thresholds"]
     assert not shields.slow_policies([learned])
+    assert not shields.slow(session)
     assert Startup().has("dqn")  # a server that is not to compile it
 
 

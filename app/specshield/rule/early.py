@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
-from specshield.boxed import Boxed, box
-from specshield.compiled import kernel, leaf
+from specshield.compiled import Boxed, box, kernel, leaf
 from specshield.rule.residual import all_of
 from specshield.rule.values import places
 from specshield.rule.view import View, view_of

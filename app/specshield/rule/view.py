@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
-from specshield.boxed import Boxed, box
-from specshield.compiled import inlined, kernel
+from specshield.compiled import Boxed, box, inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Always, And, Formula, Node, Until
 from specshield.stl.conjunction import is_predicate

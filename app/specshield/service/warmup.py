@@ -22,14 +22,19 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.lowering import BaseLower
 
 from specshield.arrays import Floats
+from specshield.compiled import box
 from specshield.policy.lattice import Lattice
 from specshield.policy.progress import make_rules
-from specshield.policy.reachability.around.field import distances, goal_cells
+from specshield.policy.progress.recall import Past
+from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
+from specshield.policy.reachability.around.search import go_around
 from specshield.policy.reachability.latest import sweep
 from specshield.policy.reachability.policy import synthesise
+from specshield.policy.reachability.tables import Guide
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
+from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import make_body, motion_count, overlap, step, successors
 from specshield.service.sessions import packing, record
 from specshield.service.storage.keeper import at_end_of_input
@@ -48,7 +53,7 @@ REGIONS = {
     "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
     "C": {"type": "polygon", "vertices": [[1.2, 1.2], [2.0, 1.2], [2.0, 2.0]]},
 }
-START, AWAY, OFF = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8), (-9.0, 0.0, 0.0)  # in A, out of it, and off the map
+START, AWAY = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8)  # in A and out of it
 
 
 def warm_up(part: str) -> None:
@@ -91,9 +96,18 @@ def _decide() -> None:
     refusal(shield, np.array([START]), {})
     _in_trouble(policy, logits)
     distances(shield.body, goal_cells(shield.body, make_rules(task)))
-    # The search for ways around is reachability's too. By now the other process has compiled what it calls.
-    # Off the map it gives up soon.
-    synthesise(task).on_body(shield.body, True).propose(np.array([OFF]), {}, 0.0)
+    _search(task)
+
+
+def _search(task: Task) -> None:
+    """The search for ways around. It is one of reachability's too, but the other process has more to compile,
+    and by now has compiled what the search calls.
+    """
+    body, rules, wait = make_body(task.robot, task.grid), make_rules(task), task.robot.wait_motion
+    guide = box(Guide(body, rules, synthesise(task).tables, wait, NOTHING_BARRED))
+    past = Past(0.0, np.array([START]), np.empty((1, 0)))
+    ways = np.empty((len(task.robot.motions), task.horizon), np.int64)
+    go_around(guide, 0.0, past, NO_FIELDS, np.empty((*ways.shape, 3)), ways, 1)
 
 
 @dataclass(frozen=True)
@@ -111,9 +125,7 @@ class _Standing:
 
 
 def _in_trouble(policy: _Standing, logits: np.ndarray) -> None:
-    """The kernels for a robot in trouble: walled in, where it must not be, or stopped by something unknown.
-    And those for a threshold below 1.
-    """
+    """The kernels for a robot in trouble: walled in, where it must not be, or stopped by the unknown."""
     shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
     first = episode.decide(shield, [START], logits)
     around = [[1.0 + 0.4 * np.cos(a), 1.0 + 0.4 * np.sin(a)] for a in np.arange(0.0, 6.3, 0.1)]
@@ -124,8 +136,6 @@ def _in_trouble(policy: _Standing, logits: np.ndarray) -> None:
     successors(shield.body, np.array(START), np.empty((motion_count(shield.body), 3)))
     step(shield.body, *START, 0)
     overlap(shield.body, *START)
-    for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
-        episode.decide(make_shield([policy], config), [START], logits)
 
 
 def _decide_rarely() -> None:
@@ -147,6 +157,13 @@ def _plan() -> None:
     planner.synthesise(_task()).propose(np.array([START]), {}, 0.0)
 
 
+def _take_chances() -> None:
+    """The kernels for a threshold below 1."""
+    policy, logits = _Standing(_task()), np.zeros(len(STRETCH.actions))
+    for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
+        episode.decide(make_shield([policy], config), [START], logits)
+
+
 def _roll_out() -> None:
     """The kernels of a DQN."""
     from specshield.policy.dqn.network import NAMES, make_network
@@ -164,8 +181,11 @@ def _roll_out() -> None:
 
 PARTS: dict[str, Callable[[], None]] = {"reachability": _propose, "shield": _decide}
 LATER: dict[str, Callable[[], None]] = {
-    "dqn": _roll_out, "rarer decisions": _decide_rarely, "planner": _plan,
-}  # fmt: skip
+    "dqn": _roll_out,
+    "thresholds": _take_chances,
+    "rarer decisions": _decide_rarely,
+    "planner": _plan,
+}
 
 
 def _task(**regions: dict[str, Any]) -> Task:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from specshield.arrays import Floats
-from specshield.boxed import Boxed
+from specshield.compiled import Boxed
 from specshield.errors import InputError, PolicyError
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
-from specshield.boxed import Boxed
-from specshield.compiled import inlined, kernel
+from specshield.compiled import Boxed, inlined, kernel
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.values import signal_rows
 from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count, view_of

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from specshield.boxed import box
+from specshield.compiled import box
 from specshield.policy.progress import PENDING, SETTLED, make_rules
 from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells, spare_on

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from specshield.boxed import box
+from specshield.compiled import box
 from specshield.policy.lattice import STEP_CODES
 from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.policy.progress.recall import Past

@@ -21,7 +21,7 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Codes, Floats, Int32s
-from specshield.boxed import box
+from specshield.compiled import box
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch

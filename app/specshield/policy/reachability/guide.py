@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
-from specshield.boxed import Boxed
-from specshield.compiled import inlined, kernel, leaf
+from specshield.compiled import Boxed, inlined, kernel, leaf
 from specshield.policy.lattice import Corners
 from specshield.policy.progress import (
     ALWAYS,

@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
-from specshield.boxed import Boxed
-from specshield.compiled import kernel, leaf
+from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import copy_ways
 from specshield.policy.progress import SETTLED
 from specshield.policy.progress.recall import Past

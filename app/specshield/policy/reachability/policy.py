@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Bools, Floats
-from specshield.boxed import Boxed, box
+from specshield.compiled import Boxed, box
 from specshield.errors import MapError, PolicyError, SampleError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses

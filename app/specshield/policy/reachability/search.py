@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
-from specshield.boxed import Boxed
-from specshield.compiled import kernel, leaf
+from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
 from specshield.policy.progress.recall import Past, Present, resume
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, beam_search

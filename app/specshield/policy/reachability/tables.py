@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints
-from specshield.boxed import Boxed
-from specshield.compiled import inlined, kernel, leaf
+from specshield.compiled import Boxed, inlined, kernel, leaf
 from specshield.policy.lattice import (
     INVALID,
     STEP_CODES,

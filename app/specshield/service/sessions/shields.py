@@ -38,8 +38,8 @@ class Shields:
     def __init__(
         self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda method: True
     ) -> None:
-        """room: for so many shields. is_compiled: whether a method's kernels are there, so that its decisions
-        need not compile them (warmup.LATER).
+        """room: for so many shields. is_compiled: whether the kernels of a part of warmup.LATER are there, so
+        that decisions need not compile them.
         """
         self.policies, self._is_compiled = policies, is_compiled
         self._shields = files.Recent[Shield](room)
@@ -52,7 +52,10 @@ class Shields:
 
     def slow(self, session: Session) -> bool:
         """Whether decisions take long and another process can make them, which has no prepared preference."""
-        return session.config["shaping"] == PROJECTION and self.slow_policies(session.config["policy_ids"])
+        if session.config["shaping"] != PROJECTION:
+            return False
+        compiles = session.settings.threshold < 1.0 and not self._is_compiled("thresholds")
+        return compiles or self.slow_policies(session.config["policy_ids"])
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)

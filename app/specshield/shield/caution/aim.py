@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
-from specshield.boxed import Boxed
-from specshield.compiled import kernel
+from specshield.compiled import Boxed, kernel
 from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, rho_of

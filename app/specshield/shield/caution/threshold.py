@@ -18,8 +18,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
-from specshield.boxed import Boxed
-from specshield.compiled import kernel, leaf
+from specshield.compiled import Boxed, kernel, leaf
 from specshield.portable import inner
 from specshield.robot.body import Body, centre, displacement
 from specshield.robot.contact import free_distance

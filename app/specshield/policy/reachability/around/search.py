@@ -17,8 +17,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
-from specshield.boxed import Boxed
-from specshield.compiled import kernel, leaf
+from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
