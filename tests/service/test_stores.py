@@ -7,7 +7,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -184,6 +184,16 @@ def test_a_life_behind_tls(tmp_path):
         a_whole_life(server, tmp_path, url)
 
 
+async def refused(call: Callable[[], Awaitable[object]]) -> None:
+    """Asks until the reason is that no replica answers: on a busy machine the store itself may be late."""
+    said = "TimeoutError"
+    while "TimeoutError" in said:
+        with pytest.raises(StoreError) as error:
+            await call()
+        said = str(error.value)
+    assert "0 of 1 replicas" in said
+
+
 @pytest.mark.parametrize("kind", [watched, cluster])
 def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
     """With SPECSHIELD_STORE_REPLICAS=1. What is written is told later, to whoever asks again."""
@@ -197,13 +207,10 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
         step = Change(b"state", bytes(24), 24, 0, b"what the step left")
         os.kill(replica, signal.SIGSTOP)
         try:
-            with pytest.raises(StoreError, match="0 of 1 replicas"):
-                await store.append(id, seen.version, step)
-            with pytest.raises(StoreError, match="0 of 1 replicas"):
-                await store.load(id, 0)
+            await refused(lambda: store.append(id, seen.version, step))
+            await refused(lambda: store.load(id, 0))
             if kind is watched:
-                with pytest.raises(StoreError, match="0 of 1 replicas"):
-                    await store.ping()
+                await refused(store.ping)
         finally:
             os.kill(replica, signal.SIGCONT)
         while True:

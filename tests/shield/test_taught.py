@@ -453,9 +453,8 @@ def test_what_is_in_the_way_is_not_waited_for_where_waiting_would_break_the_rule
     grid = OccupancyGrid(np.zeros((20, 120), bool), 0.05)
     regions = {"Goal": GOAL | {"center": [5.3, 0.5]}, "Zone": GOAL | {"center": [3.0, 0.5], "radius": 0.45}}
     task = make_task(grid, STRETCH, "F[0,70] Goal and G[12,80] not Zone", regions)
-    shield = make_shield(
-        [synthesise(task, Settings(pitch=0.1))], Config(learn_map=True, uncertainty=uncertainty)
-    )
+    policy = synthesise(task, Settings(pitch=0.05))  # not so small that each beam tries nearly every way
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=uncertainty))
     blocked = [(x, y) for x in np.arange(3.525, 3.8, 0.05) for y in np.arange(0.025, 1.0, 0.05)]
     there = grid.occupied.copy()
     there[:20, 70:76] = True

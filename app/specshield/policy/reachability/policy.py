@@ -94,7 +94,9 @@ class ReachabilityPolicy(Carded):
         """The policy for deadlines that come so many steps earlier, and for the first motions `wanted` [M].
         It proposes nothing for a robot that cannot wait, or where its tables say that it would be too late.
         """
-        return self._but(self._body, early=steps, wanted=wanted)
+        other = self._but(self._body, early=steps, wanted=wanted)
+        other.__dict__["_guide"] = self._guide
+        return other
 
     def giving_up(self, lost: tuple[Formula, ...]) -> ReachabilityPolicy:
         """`briefly`, and as if the windows of these parts of the rule were over before it began."""
