@@ -124,6 +124,7 @@ def test_a_server_switches_the_same(server: RunningServer) -> None:
         assert [(each.t, each.rule) for each in local.trajectory()] == [
             (each.t, each.rule) for each in remote.trajectory()
         ]
+        assert [local.rule_at(t) for t in (0, 20, 40)] == [remote.rule_at(t) for t in (0, 20, 40)]
         assert [decision.t for decision in local.events(55)] == [56, 57, 58, 59]
         wall = LocalShield.make(LocalShield.shipped("case1").task.grid, "F[0,3] x > 9 and F[0,3] x < 1")
         with pytest.raises(InfeasibleSwitch):

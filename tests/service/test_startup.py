@@ -152,9 +152,13 @@ def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_
     assert shields.slow_policies([learned])
     assert not shields.slow_policies([computed])
     config = {"shaping": "projection", "policy_ids": [computed]}
-    session = SimpleNamespace(config=config, settings=Config(0.5))
+    session = SimpleNamespace(config=config, settings=Config(threshold_over="episode"))
     assert shields.slow(session)
-    startup.parts += ["dqn", "thresholds"]
+    startup.completing = False  # as where it cannot be compiled
+    assert not shields.slow(session)
+    startup.completing = True
+    assert shields.slow(session)
+    startup.parts += ["dqn", "chances"]
     assert not shields.slow_policies([learned])
     assert not shields.slow(session)
     assert Startup().has("dqn")  # a server that is not to compile it

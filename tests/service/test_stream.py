@@ -183,7 +183,7 @@ PING, EMPTY, STEP = b"\x89\x80" + bytes(4), b"\x00\x80" + bytes(4), b"\x81\x82" 
 
 @pytest.mark.parametrize("frame", [PING, EMPTY, STEP], ids=["pings", "empty fragments", "steps"])
 def test_a_flood_of_small_frames_holds_up_nobody(server, client, begin, frame):
-    """By how much of it the server takes before it answers others: uvicorn would take 256 KB at once."""
+    """The server takes little of the flood before it answers others, where uvicorn takes 256 KB at once."""
     with connect(stream_of(server, begin()), ping_interval=None) as stream:
         flood, over, sent = stream.socket, threading.Event(), 0
         flood.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 16)

@@ -35,7 +35,8 @@ for part in warmup.PARTS:
 before = ready()
 start = (4.5, 5.0, 0.0)
 ending = np.where(case.task.robot.terminal, 0.0, -np.inf)
-episode.decide(make_shield([policy], Config()), [start], ending)
+for threshold, wanted in ((0.5, logits), (0.5, ending), (1.0, ending)):
+    episode.decide(make_shield([policy], Config(threshold)), [start], wanted)
 ring = [[4.5 + 0.4 * np.cos(a), 5.0 + 0.4 * np.sin(a)] for a in np.arange(0.0, 6.3, 0.1)]
 for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
     shield = make_shield([policy], config)
@@ -52,8 +53,9 @@ before = ready()
 card = json.loads((MODELS / "case1-dqn" / "card.json").read_text())
 learned = load_policy(MODELS / "case1-dqn" / "policy.safetensors", card, case.task)
 default = {"uncertainty": Uncertainty(), "learn_map": True}
-over = {"threshold": 0.5, "threshold_over": "episode"}
-for some in ({}, {"threshold": 0.5}, default, {"threshold": 0.5, **default}, {**over, **default}):
+over = {"threshold_over": "episode", **default}
+half = {"threshold": 0.5}
+for some in ({}, half, default, {**half, **default}, over, {**half, **over}):
     for each in (policy, learned):
         shield = make_shield([each], Config(**some))
         episode.decide(shield, [start], ending)

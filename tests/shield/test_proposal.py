@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from specshield.shield.episode import Config, InfeasibleStart, decide, make_shield, start
+from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal, adapted, ask
 from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
 
@@ -101,6 +102,23 @@ def test_a_proposer_that_raises_where_it_is_told_of_the_map_is_said_not_to_be_us
     decision = decide(shield, [REACH.pose(0, 0, 0)], EVEN, occupied=[[0.5, 0.5]])
     assert decision.warnings == ("a policy was not used at this step: it raised RuntimeError",)
     assert {m for m in range(MOTIONS) if decision.j_values[m] == 1.0} <= STANDING
+
+
+def test_a_robot_in_a_forbidden_place_is_told_something_though_no_policy_can_be_used():
+    """Ways out are continued by what the policies propose at their ends, and here that is nothing."""
+    cells = Cells("G[0,6] not C", None, {"C": (0, 0)})
+    liar = Liar(lambda history: 1 / 0, cells)
+    decision = decide(make_shield([liar]), [cells.pose(0, 0, 0)], EVEN)
+    assert decision.mode == "violated"
+    assert "a policy was not used at this step: it raised ZeroDivisionError" in decision.warnings
+
+
+def test_no_future_is_simulated_where_none_is_proposed():
+    shield = make_shield([Exhaustive(REACH)])
+    history = np.array([REACH.pose(0, 0, 0)])
+    prefix = prefix_of(REACH.task, REACH.task.formula, shield.view, history, {})
+    found = simulated(prefix, shield.body, [], 0, ["why"])
+    assert (len(found.motions), len(found.rho), found.warnings) == (0, 0, ("why",))
 
 
 def test_a_proposer_without_a_method_for_it_stays_as_it_is():

@@ -60,7 +60,7 @@ def test_the_target_is_seen_near_ahead_and_in_the_open(target, theta, expected):
 @example(x=5.0, y=1.9, theta=0.0, dx=8.0, dy=0.0, turn=1.5)
 def test_senses_are_egocentric(x, y, theta, dx, dy, turn):
     """Moving the map, the target and the robot together changes nothing."""
-    assume(not (4.99 < x < 5.51 and 1.99 < y < 2.51))  # on the pillar's edge, rounding puts it in or out
+    assume(not (4.99 < x < 5.51 and 1.99 < y < 2.51))  # at its edge, rounding puts it in or out
     c, s = math.cos(turn), math.sin(turn)
 
     def moved(px, py):

@@ -201,6 +201,10 @@ class LocalSession:
         self.info, self.spec_status, self.finished = info, info.spec_status, False
         return info
 
+    def rule_at(self, t: int) -> str:
+        """The rule that decides step t."""
+        return str([rule for rule in self._rules if rule.begins <= t][-1].shield.task.formula)
+
     def events(self, after: int | None = None) -> Iterator[Decision]:
         """The decisions after step `after`, by default those from now on; -1: from the first. It ends at the
         first step that is not decided yet.

@@ -144,7 +144,7 @@ class Settings(BaseSettings):
         None, description="Whether to start a training worker. By default, if the store is embedded."
     )
     complete: bool = Field(
-        True, description="Whether to compile, once ready, the kernels that only some rules and robots need."
+        True, description="Whether to compile, once ready, the kernels that only some sessions need."
     )
     training_timeout: int = Field(
         6 * 3600, ge=1, description="Longest training run of a method that learns [s]."

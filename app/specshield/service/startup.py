@@ -4,7 +4,7 @@
 
 The first start of an installation compiles the kernels, in one process for each part, and keeps them on the
 disk. Later starts take them from there. Of several server processes one compiles, and the others wait for it.
-The kernels that only some rules and robots need are compiled once the server is ready, at a low priority.
+The kernels that only some sessions need are compiled once the server is ready, at a low priority.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from specshield.service import warmup
 from specshield.service.storage.keeper import private
 
 # The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; the file `complete`,
-# that the kernels that only some rules and robots need are there too.
+# that the kernels that only some sessions need are there too.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 228  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 70  # [s] of a first start on two quiet cores; 27 to 73 were measured (`make wheels` prints it)
@@ -57,7 +57,10 @@ class Startup:
     completing: bool = False
 
     def has(self, part: str) -> bool:
-        """Whether this part's kernels are compiled, or no process is going to compile them."""
+        """Whether the kernels of a part of warmup.LATER are compiled, or no process is going to compile them.
+        True for any other name. Of several server processes, one that waits for another to compile does not
+        know of a part before all are compiled.
+        """
         return part not in warmup.LATER or not self.completing or part in self.parts
 
     def problem(self) -> SpecshieldError | None:
@@ -121,17 +124,17 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 
 
 async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
-    """Once the server is ready, compiles the kernels that only some rules and robots need, in `at_once`
+    """Once the server is ready, compiles the kernels that only some sessions need, in `at_once`
     processes. Else their first decision would compile them, while all others wait. False if some are missing.
     """
     startup.completing = True
-    while not startup.ready:
-        await asyncio.sleep(CHECK_EVERY)
     try:
         mark = await asyncio.to_thread(compiled.mark, COMPLETE)
         if mark is None or mark.exists():
             return True
-        log.info("compiling, in the background, the kernels that only some rules and robots need")
+        while not startup.ready:
+            await asyncio.sleep(CHECK_EVERY)
+        log.info("compiling, in the background, the kernels that only some sessions need")
         await _compile(startup, warmup.LATER, mark, at_once, nice)
         if mark.exists():
             return True

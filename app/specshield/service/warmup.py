@@ -158,10 +158,9 @@ def _plan() -> None:
 
 
 def _take_chances() -> None:
-    """The kernels for a threshold below 1."""
-    policy, logits = _Standing(_task()), np.zeros(len(STRETCH.actions))
-    for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
-        episode.decide(make_shield([policy], config), [START], logits)
+    """The kernels for a threshold over the episode."""
+    config = Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")
+    episode.decide(make_shield([_Standing(_task())], config), [START], np.zeros(len(STRETCH.actions)))
 
 
 def _roll_out() -> None:
@@ -182,7 +181,7 @@ def _roll_out() -> None:
 PARTS: dict[str, Callable[[], None]] = {"reachability": _propose, "shield": _decide}
 LATER: dict[str, Callable[[], None]] = {
     "dqn": _roll_out,
-    "thresholds": _take_chances,
+    "chances": _take_chances,
     "rarer decisions": _decide_rarely,
     "planner": _plan,
 }

@@ -134,8 +134,8 @@ def futures(
 def simulated(
     prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
 ) -> Futures:
-    """The futures of motions, one or more arrays [n, T - t] in range: simulated and judged at once."""
-    motions = np.concatenate(rows)
+    """The futures of motions, rows of arrays [n, T - t] that are in range: simulated and judged at once."""
+    motions = np.concatenate(rows or [np.empty((0, prefix.steps), np.int64)])
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.value.tree.size))
     violated = prefix.high <= SATISFIED_ABOVE  # then parts of the rule are judged, on every row as a whole

@@ -104,7 +104,7 @@ def ask(
 
 @leaf
 def _out_of_range(motions: Ints, count: int) -> int:
-    """The first entry (of rows that follow one another) that is not from 0 to count - 1; -1 if all are."""
+    """The index, row by row, of the first motion that is not from 0 to count - 1; -1 if there is none."""
     rows, steps = motions.shape
     for n in range(rows):
         for i in range(steps):

@@ -32,7 +32,7 @@ def own_server(
 
     worker: whether it makes policies too. say: called with the progress of the server's start. key: a key
     that it takes beside those in `data`. complete: whether it compiles, once ready, the kernels that only
-    some rules and robots need, which slows the rest for a while. Raises ServerError with the server's log if
+    some sessions need, which slows the rest for a while. Raises ServerError with the server's log if
     it does not become ready.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:

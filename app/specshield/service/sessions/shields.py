@@ -36,10 +36,10 @@ class Shields:
     """
 
     def __init__(
-        self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda method: True
+        self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda part: True
     ) -> None:
-        """room: for so many shields. is_compiled: whether the kernels of a part of warmup.LATER are there, so
-        that decisions need not compile them.
+        """room: for so many shields. is_compiled: whether the kernels of a part of warmup.LATER are compiled,
+        so that decisions need not do it. A method that is quick once they are is called like its part.
         """
         self.policies, self._is_compiled = policies, is_compiled
         self._shields = files.Recent[Shield](room)
@@ -54,7 +54,8 @@ class Shields:
         """Whether decisions take long and another process can make them, which has no prepared preference."""
         if session.config["shaping"] != PROJECTION:
             return False
-        compiles = session.settings.threshold < 1.0 and not self._is_compiled("thresholds")
+        over_episode = session.settings.threshold_over == "episode"
+        compiles = over_episode and not self._is_compiled("chances")
         return compiles or self.slow_policies(session.config["policy_ids"])
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
