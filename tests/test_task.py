@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import pickle
 import re
 import weakref
 
@@ -13,7 +14,7 @@ import pytest
 from specshield.errors import FormulaError, HorizonError, MapError, SampleError
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
-from specshield.rule.view import view_of
+from specshield.rule.view import look, view_of
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.uncertainty import Uncertainty
@@ -160,3 +161,15 @@ def test_no_more_is_kept_with_a_task_than_its_bound():
     assert [counted(task, number) for number in range(1, MAX_KEPT + 1)] == list(range(1, MAX_KEPT + 1))
     counted(task, 0)  # was the first to go
     assert calls == [0, *range(1, MAX_KEPT + 1), 0]
+
+
+def test_a_task_is_sent_to_another_process_with_all_that_was_made_of_it():
+    task = make_task(GRID, STRETCH, "F[0,3] A", {"A": DISC})
+    view = view_of(task, task.formula)
+    sent = pickle.loads(pickle.dumps(task))
+    again = view_of(sent, sent.formula)
+    assert again.value.last.tolist() == view.value.last.tolist() == [3]
+    bounds = [
+        look(each, np.array([[1.0, 1.0, 0.0]]), np.empty((1, 0)), np.empty(4)) for each in (view, again)
+    ]
+    assert bounds[0] == bounds[1]
