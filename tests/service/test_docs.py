@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import httpx
@@ -17,8 +16,7 @@ from specshield.service.app import create_app
 from specshield.service.examples import POLICY
 from specshield.service.problems import status_of
 from specshield.service.settings import Settings
-from tests.browsing import CHROMIUM, needs_chromium
-from tests.serving import HUNG
+from tests.browsing import needs_chromium
 
 COMMITTED = Path(__file__).parents[2] / "openapi.json"
 
@@ -227,30 +225,16 @@ def body_of(operation, told):
 
 
 @needs_chromium
-def test_the_page_is_there_without_the_internet(server, tmp_path):
-    """A browser that can resolve no name but the server's draws the page."""
+def test_the_page_is_there_without_the_internet(server, browse, tmp_path):
+    """A browser that reaches nothing but the server draws the page."""
     picture = tmp_path / "docs.png"
-    page = subprocess.run(
-        [
-            CHROMIUM,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--disable-dev-shm-usage",
-            "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            "--window-size=1200,2400",
-            "--virtual-time-budget=10000",
-            f"--screenshot={picture}",
-            "--dump-dom",
-            f"{server.url}/docs",
-        ],
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-    )
-    for shown in ("/v1/sessions/{session_id}/steps", "Decide one step", "Check a formula", "Send a map"):
-        assert shown in page.stdout.replace("​", ""), page.stderr[-2000:]
+    with browse(viewport={"width": 1200, "height": 2400}) as (page, _):
+        page.route(lambda url: not url.startswith(server.url), lambda route: route.abort())
+        page.goto(f"{server.url}/docs")
+        for shown in ("Decide one step", "Check a formula", "Send a map"):
+            page.get_by_text(shown, exact=True).first.wait_for()
+        assert "/v1/sessions/{session_id}/steps" in page.content().replace("\u200b", "")
+        page.screenshot(path=picture)
     drawn = np.asarray(Image.open(picture).convert("L"))
     assert (drawn < 128).mean() > 0.005  # text
     assert len(np.unique(drawn)) > 50
