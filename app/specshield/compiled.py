@@ -224,8 +224,8 @@ class Boxed(structref.StructRefProxy, Generic[S]):  # type: ignore[misc]
 
     At each call numba takes a struct apart: in 0.15 us for each of its 27 to 43 arrays, by code that each
     kernel has of its own and that takes 0.3 to 0.6 s to compile. A boxed struct is taken apart once, by
-    `box`, and then a call takes 0.6 us. The struct never changes. Only a `kernel` may read it, since a leaf
-    counts no references.
+    `box`, and then a call takes 0.6 us (docs/decisions.md). The struct never changes. Only a `kernel` may
+    read it, since a leaf counts no references.
     """
 
     __slots__ = ("value",)

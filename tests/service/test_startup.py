@@ -11,9 +11,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import httpx
+import numpy as np
 import pytest
 
 from specshield import compiled
@@ -21,7 +21,9 @@ from specshield.client import ShieldClient
 from specshield.cores import cores
 from specshield.errors import Starting, TransportError
 from specshield.service.heavy.uploads import policies_of
+from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
+from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, READY, Startup
 from specshield.shield.decision import Config
@@ -152,7 +154,8 @@ def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_
     assert shields.slow_policies([learned])
     assert not shields.slow_policies([computed])
     config = {"shaping": "projection", "policy_ids": [computed]}
-    session = SimpleNamespace(config=config, settings=Config(threshold_over="episode"))
+    state = State(0, 0, True, "pending", 0.0, b"")
+    session = Session([config], Config(threshold_over="episode"), state, b"", np.empty((0, 3)), [], 0, 0)
     assert shields.slow(session)
     startup.completing = False  # as where it cannot be compiled
     assert not shields.slow(session)

@@ -125,7 +125,7 @@ class _Standing:
 
 
 def _in_trouble(policy: _Standing, logits: np.ndarray) -> None:
-    """The kernels for a robot in trouble: walled in, where it must not be, or stopped by the unknown."""
+    """The kernels for a robot that is walled in, in a forbidden place, or stopped by what no map shows."""
     shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
     first = episode.decide(shield, [START], logits)
     around = [[1.0 + 0.4 * np.cos(a), 1.0 + 0.4 * np.sin(a)] for a in np.arange(0.0, 6.3, 0.1)]

@@ -105,7 +105,7 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
 def hurried(guide: Guide, margin: float, early: int, past: Past) -> tuple[Guide, bool]:
     """The guide for deadlines that come `early` steps earlier, and whether any does: those of each F that is
     open at step t and can still be met so early. A window keeps at least half its length. For a robot that
-    cannot wait, no deadline comes earlier.
+    cannot wait, no deadline comes earlier. margin [m]: by which x_0..x_t has settled what it has.
     """
     if guide.wait < 0:
         return guide, False

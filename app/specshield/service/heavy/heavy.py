@@ -18,7 +18,7 @@ from specshield.service.settings import Settings
 # Niceness, chosen by hand: the server itself has 0, and the making of policies (`specshield worker`) 10 more.
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
-DECISION_TIMEOUT = 60.0  # [s]; the slowest known step takes 1 s, and the first one may compile its kernels
+DECISION_TIMEOUT = 30.0  # [s]; the slowest known step takes 1 s, and the first may compile its kernels
 DECISION_MEMORY = 4 << 30  # [bytes]: for the tables of a few policies and of a look-ahead
 IDLE = 60.0  # [s] after the last call until a child ends, and until the template ends after the last child
 
