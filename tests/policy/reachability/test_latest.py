@@ -6,10 +6,22 @@ import numpy as np
 
 from specshield.policy.lattice import NO_TIME, holds_at, make_lattice
 from specshield.policy.progress import ALWAYS, make_rules
-from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
+from specshield.policy.reachability.latest import (
+    LEAST_LATE,
+    Phase,
+    lateness,
+    latest_times,
+    masks_of,
+    phases_of,
+)
+from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.tables import LATE
+from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import CELL
-from tests.policy.reachability.corridor import EAST, NORTH, SOUTH, WEST, make_corridor
+from tests.policy.reachability.corridor import EAST, NORTH, SOUTH, WEST, guide_of, make_corridor, pose
 
 
 def latest(formula, **cells):
@@ -71,3 +83,17 @@ def test_which_goals_can_be_settled_before_others():
     assert masks_of(rules) == [3, 1, 0]
     rules = make_rules(make_corridor("F[0,4] A and F[4,7] B", A=1, B=5))
     assert sorted(masks_of(rules)) == [0, 1, 2, 3]
+
+
+def test_how_far_the_tables_err():
+    """At the crossings they are exact. Strides of a tenth of the pitch are seen a few steps wrong."""
+    guide = guide_of(make_corridor("F[0,10] A", A=5))
+    exact = np.array([pose(column, heading) for column in range(6) for heading in range(4)])
+    assert lateness(guide, 12, exact) == LEAST_LATE
+    body = {"footprint": {"radius": 0.2}}
+    moves = [{"name": "on", "translate": 0.03}, {"name": "wait"}]
+    turns = [{"name": name, "rotate": angle} for name, angle in (("left", 0.1), ("right", -0.1))]
+    short = robot_from_json(body | {"actions": [*moves, *turns]})
+    region = {"A": {"type": "circle", "center": [3.0, 1.5], "radius": 0.5}}
+    task = make_task(OccupancyGrid(np.zeros((30, 40), bool), 0.1), short, "F[0,200] A", region)
+    assert synthesise(task, Settings(pitch=0.9)).tables.late < LATE

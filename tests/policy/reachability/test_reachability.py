@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.methods import load_policy
 from specshield.policy.reachability.policy import Settings, check, synthesise
+from specshield.policy.reachability.tables import LATE
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
 from specshield.shield.episode import decide, make_shield, start
@@ -169,6 +170,7 @@ def test_a_policy_comes_back_from_its_files_as_it_was():
     again = load_policy(policy.weights(), policy.card, task)
     ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
     np.testing.assert_array_equal(ours.motions, theirs.motions)
+    assert again.tables.late == policy.tables.late
     assert synthesise(task, Settings(pitch=0.2)).weights() == policy.weights()
     assert policy.id != synthesise(task, Settings(pitch=0.1)).id
     for options in ({"pitch": 0.1}, {"pitch": 0.2, "beam": 0}, {"pitch": "fine"}):
@@ -184,6 +186,13 @@ def test_a_policy_comes_back_from_its_files_as_it_was():
     cell[0, 0] += 1000
     with pytest.raises(PolicyError, match="fit"):
         load_policy(save({"cell": cell, "bits": again.tables.bits}), restless.card, restless.task)
+    tensors = load(policy.weights())
+    for late in ([-1e9], [0.0], [float("nan")], [-3.0, -3.0]):
+        with pytest.raises(PolicyError) as caught:
+            load_policy(save({**tensors, "late": np.array(late)}), policy.card, task)
+        assert caught.value.path == "weights.late"
+    del tensors["late"]  # as version 0.1.0 wrote it
+    assert load_policy(save(tensors), policy.card, task).tables.late == LATE
 
 
 def test_a_visit_is_no_graze_where_there_is_time():

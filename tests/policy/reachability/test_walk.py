@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +16,9 @@ from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
-from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
+from specshield.policy.reachability.tables import HOPELESS, SAFE, score, score_ends, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
-from specshield.robot.dynamics import motion_count, step
+from specshield.robot.dynamics import motion_count, step, successors
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
 
@@ -79,11 +80,20 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
 
 def test_the_score_of_each_motion(visit):
     scratch = scratch_of(visit, PENDING, 0)
-    score(visit, *pose(2), 0, -1, (0, 1), scratch)
+    score(visit, *pose(2), 0, -1, scratch)
     assert scratch.scores.tolist() == pytest.approx([9.0, 7.0, 7.0, 8.0])
-    score(visit, *pose(2), 0, LEFT, (0, 1), scratch)
+    score(visit, *pose(2), 0, LEFT, scratch)
     assert scratch.scores[RIGHT] == HOPELESS
-    score(visit, *pose(2), 0, -1, (1, 2), scratch)
+
+
+def test_the_score_of_where_each_motion_ends(visit):
+    """Off the lattice too, it is what the slack of the pose there says, to the last bit."""
+    x, y, theta = pose(2) + np.array([0.03, 0.0, 0.0])
+    ends, scratch = np.empty((4, 3)), scratch_of(visit, PENDING, 0)
+    successors(visit.body, np.array([x, y, theta]), ends)
+    score_ends(visit, x, y, theta, math.cos(theta), math.sin(theta), 0, (0, 1), scratch)
+    assert [latest - 1 for latest in scratch.scores.tolist()] == [slack_at(visit, end, 1) for end in ends]
+    score_ends(visit, *pose(2), 1.0, 0.0, 0, (1, 2), scratch)
     assert scratch.scores.tolist() == pytest.approx([HOPELESS, 7.0, HOPELESS, 8.0]), (
         "one in two was asked for"
     )

@@ -16,9 +16,17 @@ from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import reads_heading
 from specshield.policy.progress import advance
 from specshield.policy.reachability.guide import copy_progress, read_due
-from specshield.policy.reachability.tables import SAFE, UNKNOWN, Guide, Scratch, is_broken, score, slack_at
+from specshield.policy.reachability.tables import (
+    SAFE,
+    UNKNOWN,
+    Guide,
+    Scratch,
+    is_broken,
+    score_ends,
+    slack_at,
+)
 from specshield.policy.tree import Heap, sink, table_size
-from specshield.robot.dynamics import around, motion_count, step_from
+from specshield.robot.dynamics import around, motion_count, step_from, unhindered
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
 
@@ -162,9 +170,9 @@ def _expand(
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
         some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # scattered by Knuth's hash
-        corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
-        lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)
+        corners = score_ends(guide, before_x, before_y, before, cos, sin, t + n, some, scratch)
+        lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(some[0], motion_count(body), some[1]):
             if scratch.scores[m] < lowest:
@@ -180,8 +188,12 @@ def _expand(
             _put(new, found, x, y, theta, scratch.status, scratch.run)
             at = _place(new, found, beam.table)
             if at == found:
-                about, known = (scratch.corners, corners) if stays else (scratch.ahead, UNKNOWN)
-                new.slack[at] = slack_at(guide, x, y, theta, t + n + 1, scratch, about, known)
+                free = (x, y, theta) == unhindered(body, before_x, before_y, before, cos, sin, m)
+                if free and corners != UNKNOWN and _goes_on(here, w, scratch):
+                    new.slack[at] = scratch.scores[m] - (t + n + 1 + tables.early)
+                else:
+                    about, known = (scratch.corners, corners) if stays else (scratch.ahead, UNKNOWN)
+                    new.slack[at] = slack_at(guide, x, y, theta, t + n + 1, scratch, about, known)
                 new.tag[at] = 0
                 found += 1
             if new.slack[at] >= band and not is_broken(new.status[at]):
@@ -190,6 +202,15 @@ def _expand(
                 joined += 1
     edges.made[n] = joined
     return found
+
+
+@inlined
+def _goes_on(here: Poses, w: int, scratch: Scratch) -> bool:
+    """Whether the scratch holds the progress of row `w` of `here`, and no dwell is under way."""
+    for k in range(scratch.status.shape[0]):
+        if scratch.status[k] != here.status[w, k] or scratch.run[k] > 0 or here.run[w, k] > 0:
+            return False
+    return True
 
 
 @leaf

@@ -12,6 +12,9 @@ m(s, p, J) is the latest time from which waiting at s settles all of the goals J
 For F[a,b] that is at most b, and L >= a has to hold. For F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, it
 is at most c1 + c2 and L - n + 1, and L >= a + b has to hold. This is backward dynamic programming by in-place
 semi-Lagrangian sweeps, bilinear between the lattice's crossings.
+
+Off the lattice L is only nearly right, by how much depends on the robot's motions, the pitch and the map. So
+it is measured for each table (`lateness`).
 """
 
 from __future__ import annotations
@@ -20,14 +23,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bytes, Codes, Int32s, Ints, Singles
-from specshield.compiled import kernel
+from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints, Singles
+from specshield.compiled import Boxed, box, kernel
 from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules, goals_of
-from specshield.policy.reachability.tables import Tables
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, goals_of
+from specshield.policy.reachability.beam import MAX_SCORED, beam_search
+from specshield.policy.reachability.guide import copy_progress, make_scratch
+from specshield.policy.reachability.tables import LATE, Guide, Tables, guided, slack
+from specshield.robot.dynamics import motion_count
 
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
 MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop
+LEAST_LATE, MOST_LATE = -2, -6  # [steps] what `lateness` finds at least and at most
+HARDLY = 0.01  # the share of beams that find a way, up to which it is not worth to look for one
 
 
 def masks_of(rules: Rules) -> list[int]:
@@ -245,5 +253,50 @@ def time_tables(
     bit[goals] = 1 << np.arange(len(goals))
     ends = np.array([phase.end for phase in phases], np.int32)
     phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
-    none = np.empty((0, 0, 0, 0), np.uint8)
-    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch, 0)
+    none, steps = np.empty((0, 0, 0, 0), np.uint8), (np.zeros_like(bit), np.zeros_like(bit))
+    return Tables(cell, code, table, phase, ends, bit, none, *steps, pitch, 0, LATE)
+
+
+def lateness(guide: Guide, width: int, poses: Floats) -> float:
+    """The slack [steps], LEAST_LATE to MOST_LATE, below which a beam hardly ever finds a way: `Tables.late`.
+
+    guide: of the tables; width: of a decision's beams; poses [N, 3]: drawn over free space. For each pose a
+    set of settled goals is drawn, and a step at which it has up to one step of slack less.
+    """
+    sets = np.array(masks_of(guide.rules), np.int64)
+    drawn = np.random.default_rng(0).integers(len(sets), size=len(poses))
+    done = (sets[drawn, None] & guide.tables.bit != 0).astype(np.int8)
+    status = np.where(done, SETTLED, PENDING).astype(np.int8)
+    for late in range(LEAST_LATE, MOST_LATE, -1):
+        if not _finds_ways(box(guide), width, float(late), poses, status):
+            return float(late)
+    return float(MOST_LATE)
+
+
+@kernel
+def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, status: Int8s) -> bool:
+    """Whether more than HARDLY beams find a way from poses (N, 3) with the progress `status` (N, K), each at
+    the first step at which the slack is from `late` - 1 to `late` [steps], if there is one.
+    """
+    guide = guided(boxed, 0.0)
+    tables, horizon, motions = guide.tables, guide.tables.end[-1], motion_count(guide.body)
+    scratch, every = make_scratch(guide.rules, motions), 1 + (motions - 1) // MAX_SCORED
+    tried, found = 0, 0
+    here, run, taken = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64), np.empty(1, np.int64)
+    for n in range(poses.shape[0]):
+        here[0] = poses[n]
+        copy_progress(status[n], run[0], scratch.status, scratch.run)
+        start = 0
+        for end in tables.end:
+            ahead = slack(guide, here[0, 0], here[0, 1], here[0, 2], start, scratch)
+            t = start + int(np.floor(ahead - late)) + 1
+            if start <= t <= end and t < horizon:
+                way = np.empty((1, horizon - t), np.int64)
+                own = status[n : n + 1]
+                beam_search(guide, t, here, own, run, width, late - 1.0, np.inf, every, scratch, way, taken)
+                tried, found = tried + 1, found + (taken[0] > 0)
+                break
+            start = end + 1
+        if found > HARDLY * poses.shape[0]:
+            break
+    return bool(found > HARDLY * tried)

@@ -28,14 +28,14 @@ from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack
-from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of
+from specshield.policy.reachability.latest import lateness, latest_times, masks_of, pack_times, phases_of
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.stored import read_tables, stored
-from specshield.policy.reachability.tables import Guide, Tables
+from specshield.policy.reachability.tables import LATE, Guide, Tables
 from specshield.policy.shape import headings_of, side_of
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, calmest_motion, make_body
@@ -50,6 +50,7 @@ from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
+LATE_POSES, FEW_MOTIONS = 500, 16  # poses that `lateness` is measured from, for a robot of so many motions
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
 MAPS, MAPS_BYTES = 8, 8_000_000  # maps whose distances a policy keeps, and how large their clearances may be
 FINE_ENTRIES = 1_000_000  # a lattice three times as fine is used if its tables have no more entries
@@ -133,7 +134,9 @@ class ReachabilityPolicy(Carded):
 
     @cached_property
     def _guide(self) -> Boxed[Guide]:
-        return box(Guide(self._body, self._rules, self.tables, self.task.robot.wait_motion, self.barred))
+        # On another map than the tables were made for, they err by more than was measured.
+        tables = self.tables if self.told else self.tables._replace(late=min(self.tables.late, LATE))
+        return box(Guide(self._body, self._rules, tables, self.task.robot.wait_motion, self.barred))
 
     @property
     def _fields(self) -> Floats:
@@ -247,8 +250,9 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
     settings, run = settings or Settings(), run or Run()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     pitch, cells = _extent(task, body, rules, settings)
-    tables, narrow = _tables(task, body, rules, pitch, cells)
-    wide = None if task.robot.goes_back else _tables(task, widened(body), rules, pitch, cells)[0]
+    shared = rules, pitch, cells, settings.beam
+    tables, narrow = _tables(task, body, *shared)
+    wide = None if task.robot.goes_back else _tables(task, widened(body), *shared)[0]
     policy = ReachabilityPolicy(task, {}, settings, tables, narrow, wide)
     metrics = {
         "feasible_start": round(policy.feasible_start(), 4),
@@ -259,7 +263,9 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
     return replace(policy, card=card)
 
 
-def _tables(task: Task, body: Body, rules: Rules, pitch: float, cells: Bools | None) -> tuple[Tables, Bools]:
+def _tables(
+    task: Task, body: Body, rules: Rules, pitch: float, cells: Bools | None, beam: int
+) -> tuple[Tables, Bools]:
     """The tables for a body, and the obligations that they hardly see [K]. pitch, cells: see `_extent`."""
     lattice = make_lattice(body, pitch, cells)
     holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
@@ -269,7 +275,19 @@ def _tables(task: Task, body: Body, rules: Rules, pitch: float, cells: Bools | N
         return step_tables(rules, task.horizon, cell, bits, pitch), narrow
     masks, phases = masks_of(rules), phases_of(rules, task.horizon)
     latest, valid = latest_times(lattice, rules, holds, masks, phases)
-    return pack_times(latest, valid, masks, phases, rules, pitch), narrow
+    tables = pack_times(latest, valid, masks, phases, rules, pitch)
+    return tables._replace(late=_late(task, body, rules, tables, beam)), narrow
+
+
+def _late(task: Task, body: Body, rules: Rules, tables: Tables, beam: int) -> float:
+    """`Tables.late`, measured from as many poses as take about 0.1 s."""
+    many = max(LATE_POSES * FEW_MOTIONS // max(len(task.robot.motions), FEW_MOTIONS), 1)
+    try:
+        poses = free_poses(task, body, many, np.random.default_rng(0))
+    except MapError:  # next to no free space
+        return LATE
+    guide = Guide(body, rules, tables, task.robot.wait_motion, NOTHING_BARRED)
+    return lateness(guide, beam, poses)
 
 
 def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:

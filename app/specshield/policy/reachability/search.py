@@ -2,8 +2,9 @@
 
 From the motion of most slack the robot climbs the latest feasible times (walk.py). For any other motion it is
 mostly enough to undo it and go the same way, or to turn and go the way of a motion that led to the same
-place. Where that comes too late, or the climb gets stuck, a beam looks for a way (beam.py). A robot that
-cannot stand still has tables step by step, and all its ways are found by beams.
+place. Where that comes too late, or the climb gets stuck, a beam looks for a way (beam.py): first a narrow
+one, which takes a sixth of the time and mostly finds a way where there is one. A robot that cannot stand
+still has tables step by step, and all its ways are found by beams.
 """
 
 from __future__ import annotations
@@ -29,9 +30,8 @@ ESCAPE_GAIN = 2.0  # [steps] how much later than where a climb got stuck a way o
 ESCAPE_LOSS = 6.0  # [steps] of slack that a way out may cost
 ESCAPE_LENGTH = 24  # [steps] of a way out, at most
 MAX_ESCAPES = 8  # ways out of places where one climb is stuck
-BAND = -3.0  # [steps] of slack: how far the tables may err
 ROOTS = 4  # first motions that one beam serves, where others may then go the ways it finds
-NARROW_SHARE = 2  # poses that the first beam of a robot that cannot wait keeps for each first motion
+NARROW_SHARE = 2  # poses that a first beam keeps for each first motion
 SMALL = 30_000  # poses of a lattice on which nearly every way can be tried
 SMALL_SHARE = 512  # poses that a beam keeps for each first motion on such a lattice
 
@@ -151,9 +151,9 @@ def continue_all(
             base = int(m)
     every = 1 + (order.shape[0] - 1) // (MAX_SCORED if waits else MAX_TRIED)
     while True:
-        if not waits:
-            _beam_out(guide, t, NARROW_SHARE, width, max(0.0, lowest), every, starts, scratch)
-        _beam_out(guide, t, width, width, max(BAND if waits else 0.0, lowest), every, starts, scratch)
+        late = guide.tables.late
+        _beam_out(guide, t, min(NARROW_SHARE, width), width, max(0.5 * late, lowest), every, starts, scratch)
+        _beam_out(guide, t, width, width, max(late, lowest), every, starts, scratch)
         if every == 1 or np.any(settled):
             break
         every = 1

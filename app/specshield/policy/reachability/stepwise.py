@@ -221,5 +221,5 @@ def step_tables(rules: Rules, horizon: int, cell: Int32s, bits: Bytes, pitch: fl
     phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
     bit = np.zeros(len(rules.kind), np.int64)
     return Tables(
-        cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch, 0
+        cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch, 0, 0.0
     )

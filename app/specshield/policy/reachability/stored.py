@@ -14,9 +14,9 @@ from specshield.arrays import Bools, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.extent import COARSEST
 from specshield.policy.progress import Rules, goals_of, make_rules
-from specshield.policy.reachability.latest import phases_of, time_tables
+from specshield.policy.reachability.latest import LEAST_LATE, MOST_LATE, phases_of, time_tables
 from specshield.policy.reachability.stepwise import state_count, step_tables
-from specshield.policy.reachability.tables import Tables
+from specshield.policy.reachability.tables import LATE, Tables
 from specshield.policy.shape import MAX_HEADINGS, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.task import Task
@@ -31,6 +31,8 @@ def stored(tables: Tables, wide: Tables | None, narrow: Bools, asked: float) -> 
     tensors: Tensors = {name: getattr(tables, name) for name in names}
     if wide is not None:
         tensors |= {WIDE + name: getattr(wide, name) for name in names}
+    if not len(tables.bits):
+        tensors |= {of + "late": np.array([made.late]) for of, made in (("", tables), (WIDE, wide)) if made}
     if narrow.any():
         tensors["narrow"] = narrow.astype(np.uint8)
     if tables.pitch > asked:
@@ -57,6 +59,7 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, bits.shape[2], -(-state_count(rules) // 8))
         check_fit(cell, task, pitch, bits, bits.shape == size, f"bits {list(size)}")
         return step_tables(rules, task.horizon, cell, bits, pitch)
+    late = _late_of(tensors, of)
     cell, code, table = named_arrays(
         tensors, {f"{of}cell": (np.int32, 2), f"{of}code": (np.uint16, 3), f"{of}table": (np.int32, 2)}
     )
@@ -64,7 +67,18 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
     wanted = f"code [tables, cells, {code.shape[2]}], table [{len(phases)}, {sets}]"
     check_fit(cell, task, pitch, code, fits, wanted)
-    return time_tables(rules, phases, cell, code, table, pitch)
+    return time_tables(rules, phases, cell, code, table, pitch)._replace(late=late)
+
+
+def _late_of(tensors: Tensors, of: str) -> float:
+    """How late the tables may be [steps]. Files of versions before 0.2 do not say it."""
+    kept = tensors.pop(f"{of}late", None)
+    if kept is None:
+        return LATE
+    found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
+    if not MOST_LATE <= found <= LEAST_LATE:
+        raise _other_kind(f"{of}late", found, f"float64, one number from {MOST_LATE} to {LEAST_LATE}")
+    return found
 
 
 def _pitch_of(tensors: Tensors, task: Task, asked: float) -> float:

@@ -20,9 +20,10 @@ from specshield.policy.lattice import (
     leads_back,
 )
 from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
-from specshield.robot.dynamics import Body, displacement
+from specshield.robot.dynamics import Body, displacement, unhindered
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
+LATE = -3.0  # [steps] `Tables.late` where it was not measured (lateness.py). Chosen by hand.
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
 UNKNOWN = -1  # in place of how many corners there are about a place
 DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
@@ -37,7 +38,8 @@ class Tables(NamedTuple):
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
     settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: see stepwise.py; bits
     has no steps if the tables are latest times. early [steps]: by how much deadlines are to be met earlier
-    than the latest times were computed for.
+    than the latest times were computed for. late [steps], negative: a slack with which ways are still looked
+    for, since the tables err.
     """
 
     cell: Int32s
@@ -51,6 +53,7 @@ class Tables(NamedTuple):
     dwell: Ints
     pitch: float
     early: int
+    late: float
 
 
 class Guide(NamedTuple):
@@ -236,28 +239,24 @@ def is_broken(status: Int8s) -> bool:
 
 
 @inlined
-def score(
-    guide: Guide, x: float, y: float, theta: float, t: int, last: int, some: tuple[int, int], scratch: Scratch
-) -> int:
+def score(guide: Guide, x: float, y: float, theta: float, t: int, last: int, scratch: Scratch) -> None:
     """Writes L after each motion from x_t into scratch.scores, without contact and without the progress of
     that step: a cheap order in which to try motions.
 
     last: the motion before, -1 for none; motions that lead straight back are HOPELESS, since the tables err
-    by a little. some: the first motion that is scored, and the stride to the next; others are HOPELESS.
-    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if they were
-    not needed.
+    by a little.
     """
     body, _, tables, wait, _ = guide
     scores, mask = scratch.scores, settled_goals(tables, scratch.status)
     if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
         scores[:] = SAFE
-        return UNKNOWN
+        return
     table = tables.table[tables.phase[t + 1], mask]
     headings = tables.code.shape[2]
     v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
     count = find_corners(tables.cell, v, u, scratch.corners)
     scores[:] = HOPELESS
-    for m in range(some[0], scores.shape[0], some[1]):
+    for m in range(scores.shape[0]):
         if table < 0 or leads_back(body, last, m):
             continue
         d, angle = displacement(body, m)
@@ -266,6 +265,46 @@ def score(
             scores[m] = latest_at(tables.code[table], scratch.corners, count, w)
         else:
             there = find_corners(tables.cell, v + d * dv, u + d * du, scratch.ahead)
+            scores[m] = latest_at(tables.code[table], scratch.ahead, there, w)
+    spare = _after_dwells(guide, mask, t, scratch.corners, count, h, scratch)
+    scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
+
+
+@inlined
+def score_ends(
+    guide: Guide,
+    x: float,
+    y: float,
+    theta: float,
+    cos: float,
+    sin: float,
+    t: int,
+    some: tuple[int, int],
+    scratch: Scratch,
+) -> int:
+    """Writes L where each motion from x_t ends if it meets nothing into scratch.scores, without the progress
+    of that step. To the last bit, `slack_at` then has the same of motions that change no progress.
+
+    cos, sin: of theta. some: the first motion that is scored, and the stride to the next; others are
+    HOPELESS. Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if
+    they were not needed.
+    """
+    body, _, tables, wait, _ = guide
+    scores, mask = scratch.scores, settled_goals(tables, scratch.status)
+    if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
+        scores[:] = SAFE
+        return UNKNOWN
+    table, headings = tables.table[tables.phase[t + 1], mask], tables.code.shape[2]
+    v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
+    count = find_corners(tables.cell, v, u, scratch.corners)
+    scores[:] = HOPELESS
+    for m in range(some[0], scores.shape[0] if table >= 0 else 0, some[1]):
+        end_x, end_y, heading = unhindered(body, x, y, theta, cos, sin, m)
+        to_v, to_u, w = coordinates(body, tables.pitch, headings, end_x, end_y, heading)
+        if end_x == x and end_y == y:
+            scores[m] = latest_at(tables.code[table], scratch.corners, count, w)
+        else:
+            there = find_corners(tables.cell, to_v, to_u, scratch.ahead)
             scores[m] = latest_at(tables.code[table], scratch.ahead, there, w)
     spare = _after_dwells(guide, mask, t, scratch.corners, count, h, scratch)
     scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)

@@ -64,7 +64,7 @@ def climb(
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     high, high_n = -np.inf, n
     while n < steps and not is_over(rules, tables, t + n, status):
-        score(guide, x, y, theta, t + n, motions[n - 1], (0, 1), scratch)
+        score(guide, x, y, theta, t + n, motions[n - 1], scratch)
         gained = n == high_n or scores[wait] > high + CLIMB_GAIN
         for k in range(k_count):
             gained = gained or status[k] != scratch.high_status[k]
