@@ -16,7 +16,7 @@ from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
-from specshield.policy.reachability.tables import HOPELESS, SAFE, score, score_ends, slack
+from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
 from specshield.robot.dynamics import motion_count, step, successors
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
@@ -78,25 +78,30 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
     assert here == 12 - 4 - 3  # it is over at step 4, and the cell before B will do
 
 
+def scored(guide, where, t, scratch, last=-1, some=(0, 1)):
+    x, y, theta = where
+    score(guide, x, y, theta, math.cos(theta), math.sin(theta), t, last, some, scratch)
+    return scratch.scores.tolist()
+
+
 def test_the_score_of_each_motion(visit):
     scratch = scratch_of(visit, PENDING, 0)
-    score(visit, *pose(2), 0, -1, scratch)
-    assert scratch.scores.tolist() == pytest.approx([9.0, 7.0, 7.0, 8.0])
-    score(visit, *pose(2), 0, LEFT, scratch)
-    assert scratch.scores[RIGHT] == HOPELESS
+    assert scored(visit, pose(2), 0, scratch) == pytest.approx([9.0, 7.0, 7.0, 8.0])
+    assert scored(visit, pose(2), 0, scratch, LEFT)[RIGHT] == HOPELESS
+    one_in_two = scored(visit, pose(2), 0, scratch, some=(1, 2))
+    assert one_in_two == pytest.approx([HOPELESS, 7.0, HOPELESS, 8.0])
 
 
-def test_the_score_of_where_each_motion_ends(visit):
-    """Off the lattice too, it is what the slack of the pose there says, to the last bit."""
-    x, y, theta = pose(2) + np.array([0.03, 0.0, 0.0])
-    ends, scratch = np.empty((4, 3)), scratch_of(visit, PENDING, 0)
-    successors(visit.body, np.array([x, y, theta]), ends)
-    score_ends(visit, x, y, theta, math.cos(theta), math.sin(theta), 0, (0, 1), scratch)
-    assert [latest - 1 for latest in scratch.scores.tolist()] == [slack_at(visit, end, 1) for end in ends]
-    score_ends(visit, *pose(2), 1.0, 0.0, 0, (1, 2), scratch)
-    assert scratch.scores.tolist() == pytest.approx([HOPELESS, 7.0, HOPELESS, 8.0]), (
-        "one in two was asked for"
+def test_a_score_is_the_slack_where_the_motion_ends_to_the_last_bit(visit):
+    where, ends, scratch = (
+        pose(2) + np.array([0.03, 0.0, 0.0]),
+        np.empty((4, 3)),
+        scratch_of(visit, PENDING, 0),
     )
+    successors(visit.body, where, ends)
+    assert [latest - 1 for latest in scored(visit, where, 0, scratch)] == [
+        slack_at(visit, end, 1) for end in ends
+    ]
 
 
 def test_a_climb_turns_goes_and_stays(visit):

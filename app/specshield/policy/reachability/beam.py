@@ -16,15 +16,7 @@ from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import reads_heading
 from specshield.policy.progress import advance
 from specshield.policy.reachability.guide import copy_progress, read_due
-from specshield.policy.reachability.tables import (
-    SAFE,
-    UNKNOWN,
-    Guide,
-    Scratch,
-    is_broken,
-    score_ends,
-    slack_at,
-)
+from specshield.policy.reachability.tables import SAFE, UNKNOWN, Guide, Scratch, is_broken, score, slack_at
 from specshield.policy.tree import Heap, sink, table_size
 from specshield.robot.dynamics import around, motion_count, step_from, unhindered
 
@@ -171,7 +163,7 @@ def _expand(
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
         some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # scattered by Knuth's hash
         cos, sin, room = around(body, before_x, before_y, before)
-        corners = score_ends(guide, before_x, before_y, before, cos, sin, t + n, some, scratch)
+        corners = score(guide, before_x, before_y, before, cos, sin, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(some[0], motion_count(body), some[1]):

@@ -14,13 +14,11 @@ from specshield.policy.lattice import (
     Corners,
     beside,
     coordinates,
-    coordinates_ahead,
     find_corners,
-    heading_after,
     leads_back,
 )
 from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
-from specshield.robot.dynamics import Body, displacement, unhindered
+from specshield.robot.dynamics import Body, unhindered
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
 LATE = -3.0  # [steps] `Tables.late` where it was not measured (lateness.py). Chosen by hand.
@@ -239,39 +237,7 @@ def is_broken(status: Int8s) -> bool:
 
 
 @inlined
-def score(guide: Guide, x: float, y: float, theta: float, t: int, last: int, scratch: Scratch) -> None:
-    """Writes L after each motion from x_t into scratch.scores, without contact and without the progress of
-    that step: a cheap order in which to try motions.
-
-    last: the motion before, -1 for none; motions that lead straight back are HOPELESS, since the tables err
-    by a little.
-    """
-    body, _, tables, wait, _ = guide
-    scores, mask = scratch.scores, settled_goals(tables, scratch.status)
-    if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
-        scores[:] = SAFE
-        return
-    table = tables.table[tables.phase[t + 1], mask]
-    headings = tables.code.shape[2]
-    v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
-    count = find_corners(tables.cell, v, u, scratch.corners)
-    scores[:] = HOPELESS
-    for m in range(scores.shape[0]):
-        if table < 0 or leads_back(body, last, m):
-            continue
-        d, angle = displacement(body, m)
-        w = heading_after(headings, h, angle)
-        if d == 0.0:
-            scores[m] = latest_at(tables.code[table], scratch.corners, count, w)
-        else:
-            there = find_corners(tables.cell, v + d * dv, u + d * du, scratch.ahead)
-            scores[m] = latest_at(tables.code[table], scratch.ahead, there, w)
-    spare = _after_dwells(guide, mask, t, scratch.corners, count, h, scratch)
-    scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
-
-
-@inlined
-def score_ends(
+def score(
     guide: Guide,
     x: float,
     y: float,
@@ -279,15 +245,18 @@ def score_ends(
     cos: float,
     sin: float,
     t: int,
+    last: int,
     some: tuple[int, int],
     scratch: Scratch,
 ) -> int:
     """Writes L where each motion from x_t ends if it meets nothing into scratch.scores, without the progress
-    of that step. To the last bit, `slack_at` then has the same of motions that change no progress.
+    of that step: a cheap order in which to try motions. To the last bit, `slack_at` then has the same of
+    motions that change no progress.
 
-    cos, sin: of theta. some: the first motion that is scored, and the stride to the next; others are
-    HOPELESS. Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if
-    they were not needed.
+    cos, sin: of theta. last: the motion before, -1 for none; motions that lead straight back are HOPELESS,
+    since the tables err by a little. some: the first motion that is scored, and the stride to the next;
+    others are HOPELESS. Writes the corners about (x, y) into scratch.corners and returns how many there are,
+    UNKNOWN if they were not needed.
     """
     body, _, tables, wait, _ = guide
     scores, mask = scratch.scores, settled_goals(tables, scratch.status)
@@ -298,7 +267,9 @@ def score_ends(
     v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
     count = find_corners(tables.cell, v, u, scratch.corners)
     scores[:] = HOPELESS
-    for m in range(some[0], scores.shape[0] if table >= 0 else 0, some[1]):
+    for m in range(some[0], scores.shape[0], some[1]):
+        if table < 0 or leads_back(body, last, m):
+            continue
         end_x, end_y, heading = unhindered(body, x, y, theta, cos, sin, m)
         to_v, to_u, w = coordinates(body, tables.pitch, headings, end_x, end_y, heading)
         if end_x == x and end_y == y:

@@ -6,6 +6,8 @@ predicate says so. This runs once for each first motion of each decision, so not
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
@@ -64,7 +66,8 @@ def climb(
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     high, high_n = -np.inf, n
     while n < steps and not is_over(rules, tables, t + n, status):
-        score(guide, x, y, theta, t + n, motions[n - 1], scratch)
+        cos, sin = math.cos(theta), math.sin(theta)
+        score(guide, x, y, theta, cos, sin, t + n, motions[n - 1], (0, 1), scratch)
         gained = n == high_n or scores[wait] > high + CLIMB_GAIN
         for k in range(k_count):
             gained = gained or status[k] != scratch.high_status[k]
