@@ -70,7 +70,7 @@ def test_a_body_lies_to_regions_alone():
     for formula, said in (
         ("F[0,3] touches(load)", "'load' is not a region"),
         ("F[0,3] inside(x)", "'x' is not a region"),
-        ("F[0,3] inside(Nowhere)", "nothing declares 'Nowhere'"),
+        ("F[0,3] inside(Nowhere)", "'Nowhere' is not a region"),
         ("F[0,3] inside()", "expected the name of a region after 'inside('"),
         ("F[0,3] near(A)", "nothing declares 'near'"),
     ):

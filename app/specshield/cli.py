@@ -208,7 +208,12 @@ def verify(
 
     given = {"data_dir": data_dir, "models_dir": models_dir, "maps_dir": maps_dir}
     try:
-        settings = read_settings().model_copy(update={k: v for k, v in given.items() if v is not None})
+        named = {name: folder for name, folder in given.items() if folder is not None}
+        for name, folder in named.items():
+            if not folder.is_dir():
+                option = f"--{name.replace('_', '-')}"
+                raise InputError("there is no such folder", path=option, got=str(folder), expected="a folder")
+        settings = read_settings().model_copy(update=named)
         status = verifying.verify(file, settings)
     except SpecshieldError as error:
         print(error, file=sys.stderr)
@@ -273,7 +278,7 @@ def _check_exposure(host: str, settings: Settings) -> None:
     exposed = not is_loopback(host) and settings.api_key is None
     if exposed and not on_keys(lambda keys: keys.listed(), settings):
         raise InputError(
-            f"everybody who reaches {host} could use this server, since it asks for no key",
+            f"whoever reaches {host} reaches this server, and it has no key to ask for",
             path="--host",
             got=host,
             expected="a key, by `specshield keys create` or SPECSHIELD_API_KEY; or an address that only this "

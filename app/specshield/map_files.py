@@ -23,8 +23,10 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     with suppress(OSError):
         metadata = path.read_bytes() if path.suffix.lower() in (".yaml", ".yml") else None
     if metadata is None:
-        expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
-        raise MapError("no map can be read there", path="world", got=str(path), expected=expected)
+        expected = "the path of a .yaml with its image beside it; or an OccupancyGrid or an object with a "
+        expected += "`format`, as /v1/maps takes it"
+        told = "no map can be read there" if path.exists() else "there is no such file"
+        raise MapError(told, path="world", got=str(path), expected=expected)
     own = path.parent / Path(str(read_yaml(text_of(metadata)).get("image", ""))).name
     images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
     found = [each for each in images if each.suffix.lower() in (".pgm", ".png") and each.is_file()]

@@ -196,5 +196,5 @@ def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
 
 def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
-        valid = f"up to {MAX_NAME} letters a to z, digits and _; no keyword of formulas, no x, y, theta"
+        valid = f"up to {MAX_NAME} letters, digits and _, no digit first; no keyword, no x, y or theta"
         raise error(f"{name!r} cannot be a name", path=path, got=name, expected=valid)

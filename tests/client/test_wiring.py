@@ -79,15 +79,26 @@ def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0)
             lambda poses: (*poses[-1][:2], poses[-1][2] - math.pi / 2),
             "the robot moves 90 degrees to the left of its heading",
         ),
+        (the_same, lambda poses: (*poses[-1][:2], math.degrees(poses[-1][2])), "theta is in degrees"),
         (
             lambda name, motion, _: (2.0 * motion[0], motion[1]),
             None,
             "the robot's strides are 2 times as long",
         ),
         (
+            lambda name, motion, random: (0.5 * motion[0] + random.normal(0, 0.01), motion[1]),
+            None,
+            "the robot's strides are 0.",
+        ),
+        (
             lambda name, motion, _: (motion[0], 0.5 * motion[1]),
             None,
             "the robot's turns are 0.5 times as wide",
+        ),
+        (
+            lambda name, motion, _: (motion[0], 1.4 * motion[1]),
+            None,
+            "the robot's turns are 1.4 times as wide",
         ),
         (
             lambda name, motion, _: MOTIONS.get(OTHERS.get(name, ""), motion),

@@ -104,7 +104,7 @@ def test_bad_robots_name_the_field(spec, path):
     assert caught.value.path == path
     assert caught.value.expected
     unit = {"rotate": "radians", "translate": "metres"}.get(str(path).rpartition(".")[2], "")
-    assert str(caught.value.expected).endswith(unit)
+    assert unit in str(caught.value.expected)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,13 @@ ENOUGH = 6  # [motions] that only the mistake explains; chosen by hand
 # By how much a motion may differ and still count as executed: a part of its length, plus three times the
 # noise of a robot (0.01 m and 0.5 degrees) and as much for its localisation.
 PART, FAR, TURNED = 0.3, 0.06, 0.05  # [m], [rad]
+MANY = 10  # [motions] strides, or turns, that are compared for a factor that they share; chosen by hand
+OFF = 0.3  # by how much that factor differs from 1 at least: a session learns of less by itself
+HELD = 0.3  # a robot whose motions are shorter than this share of what they should be is held by something
+LONGER = (
+    "the robot's strides are {:.2g} times as long as its actions say; poses and `translate` are in metres"
+)
+WIDER = "the robot's turns are {:.2g} times as wide as its actions say; theta and `rotate` are in radians"
 log = logging.getLogger("specshield")
 
 
@@ -58,9 +65,9 @@ class Wiring:
         if motion.told == (0j, 0.0):
             return
         self._motions.append(motion)
-        if alike(motion.found, motion.told):
-            return
-        if (wrong := diagnosed(self._motions, last[2].action_names)) is not None:
+        wrong = None if alike(motion.found, motion.told) else diagnosed(self._motions, last[2].action_names)
+        wrong = wrong or scaled(self._motions)
+        if wrong is not None:
             self._told = True
             log.warning("session %s: %s", self._session, wrong)
 
@@ -96,6 +103,21 @@ def diagnosed(motions: Sequence[Motion], names: Sequence[str]) -> str | None:
     return words
 
 
+def scaled(motions: Sequence[Motion]) -> str | None:
+    """What is wrong if strides, or turns, are all longer or shorter by nearly the same factor: each of them
+    alone may be noise. None if nothing is.
+    """
+    strides = [(each.found[0] / each.told[0]).real for each in motions if abs(each.told[0]) > FAR / 3]
+    turns = [each.found[1] / each.told[1] for each in motions if abs(each.told[1]) > TURNED / 3]
+    for ratios, words in ((strides, LONGER), (turns, WIDER)):
+        if len(ratios) >= MANY:
+            factor = _middle(ratios)
+            spread = _middle(abs(each - factor) for each in ratios)
+            if factor > HELD and abs(factor - 1.0) > max(OFF, 4.0 * spread):
+                return words.format(factor)
+    return None
+
+
 def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[str, Mistake]]:
     """The mistakes that are looked for, in words, each with what it makes of the motions."""
 
@@ -123,6 +145,13 @@ def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[
     )
     yield "the robot moves backwards where it should move forward", changed(lambda each: -each.told[0])
     yield (
+        "theta is in degrees, and should be in radians",
+        lambda i: (
+            motions[i].told[0] * cmath.rect(1.0, math.radians(theta := motions[i].before[2]) - theta),
+            math.remainder(math.degrees(motions[i].told[1]), math.tau),
+        ),
+    )
+    yield (
         "the y axis of the poses points the other way than that of the map",
         changed(lambda each: over(each, complex.conjugate)),
     )
@@ -139,19 +168,11 @@ def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[
             changed(lambda each: each.told[0] * cmath.exp(1j * aside)),
         )
         longer = _middle(abs(each.found[0]) / abs(each.told[0]) for each in strides)
-        yield (
-            f"the robot's strides are {longer:.2g} times as long as its actions say; poses and `translate` "
-            "are in metres",
-            changed(lambda each: longer * each.told[0]),
-        )
+        yield (LONGER.format(longer), changed(lambda each: longer * each.told[0]))
     turns = [each for each in motions if abs(each.told[1]) > TURNED]
     if turns:
         wider = _middle(each.found[1] / each.told[1] for each in turns)
-        yield (
-            f"the robot's turns are {wider:.2g} times as wide as its actions say; theta and `rotate` are in "
-            "radians",
-            changed(lambda each: each.told[0], wider),
-        )
+        yield (WIDER.format(wider), changed(lambda each: each.told[0], wider))
     done = {action: _done(motions, action) for action in {each.action for each in motions}}
     exchanged = [
         f"{names[a]!r} does what {names[b]!r} should do" for a, b in done.items() if b not in (a, None)

@@ -163,7 +163,8 @@ def _action(item: Any, path: str) -> Action:
         raise _wrong("terminal is true or false", f"{path}.terminal", terminal, "true or false")
     most, turn = MAX_TRANSLATE, 2 * math.pi
     translate = _number(item.get("translate", 0.0), f"{path}.translate", -most, most)
-    rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", -turn, turn, "radians")
+    wide = "a number of radians, at most a whole turn, 2 pi, either way; 30 degrees are 0.5236"
+    rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", -turn, turn, wide)
     if terminal and (translate or rotate):
         raise _wrong("a terminal action moves nothing", path, item, "no translate, no rotate")
     return Action(name, translate, rotate, terminal)
@@ -181,9 +182,10 @@ def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
         raise _wrong(f"{which} {said}", path or None, sorted(map(str, item)), expected)
 
 
-def _number(value: Any, path: str, low: float, high: float, unit: str = "metres") -> float:
+def _number(value: Any, path: str, low: float, high: float, expected: str | None = None) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise _wrong("not a number in range", path, value, f"a number from {low:g} to {high:g} {unit}")
+        expected = expected or f"a number from {low:g} to {high:g} metres"
+        raise _wrong("not a number in range", path, value, expected)
     return float(value)
 
 

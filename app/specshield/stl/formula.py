@@ -248,6 +248,6 @@ class Until(Windowed):
 def _check_name(name: str) -> None:
     how, region = region_named(name)
     if not (is_name(region) and (how is None or (how in BODY_WORDS and name == body_name(how, region)))):
-        expected = "letters a to z, digits and _, not starting with a digit, and not a keyword"
+        expected = "letters, digits and _, the first no digit, and no keyword"
         problem = f"{name!r} cannot be a name in a formula; expected {expected}"
         raise FormulaError(problem, got=name, expected=expected)

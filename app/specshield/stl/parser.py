@@ -197,8 +197,8 @@ class _Parser:
             raise self._error(f"'{_clip(token.text)}' is too large", token, "a number that a float64 holds")
         return nodes.Number(value)
 
-    def _name(self, token: Token, of_region: bool = False) -> Name:
-        if self._token.kind == "(" and token.text in BODY_WORDS and not of_region:
+    def _name(self, token: Token) -> Name:
+        if self._token.kind == "(" and token.text in BODY_WORDS:
             return self._body_name(token)
         if self._names is not None and token.text not in self._names:
             known = sorted(name for name in self._names if "(" not in name)
@@ -212,12 +212,16 @@ class _Parser:
         """`touches(R)` or `inside(R)`: `names` holds them for every region."""
         self._next()
         region = self._take("name", f"the name of a region after '{word.text}('")
-        found = self._name(region, of_region=True).name
         self._take(")", f"')' after the region of '{word.text}'")
-        name = nodes.body_name(word.text, found)
+        name = nodes.body_name(word.text, region.text)
         if self._names is not None and name not in self._names:
-            raise self._error(f"'{_clip(found)}' is not a region", region, "a region or a room of the map")
+            raise self._error(f"'{_clip(region.text)}' is not a region", region, self._regions())
         return Name(name)
+
+    def _regions(self) -> str:
+        named = (nodes.region_named(name) for name in self._names or ())
+        own = sorted({region for how, region in named if how is not None})
+        return f"one of {', '.join(own[:20])}" if own else "a region or a room of the map; there are none"
 
     def _window(self, operator: Token) -> tuple[int, int]:
         opening = self._take("[", f"a window such as [0,10]: '{operator.text}' has to be bounded")

@@ -9,7 +9,7 @@ from pydantic_core import PydanticCustomError
 
 SpecStatus = Literal["pending", "satisfied", "violated"]
 ID = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
-ID_TOLD = "1 to 64 letters a to z, digits, '_', '.' or '-', the first a letter or digit"
+ID_TOLD = "1 to 64 letters from A to Z or a to z, digits, '_', '.' or '-', the first a letter or digit"
 Id = Annotated[str, Field(pattern=f"^{ID}$")]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Pose = Annotated[
