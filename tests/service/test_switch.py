@@ -384,3 +384,16 @@ def test_a_picture_shows_the_present_floor_and_counts_the_session_s_steps(client
     assert step(session, 6, [[4.5, 5.0, 0.0]], logits=[0.0] * 20).status_code == 200
     way, picture = drawn()
     assert (len(way), "step 6. " in picture, "last step is 146." in picture) == (1, True, True)
+
+
+def test_a_picture_is_drawn_before_any_pose_on_the_new_floor_is_known(client):
+    begun = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+    path = f"/v1/sessions/{client.post('/v1/sessions', json=begun).json()['id']}"
+    first = {"t": 0, "poses": [[4.5, 5.0, 0.0]], "logits": [0.0] * 20}
+    assert client.post(f"{path}/steps", json=first).status_code == 200
+    switched = client.post(f"{path}/switch", json={"t": 1, "policy_id": "case2", "clock": "restart"})
+    assert switched.status_code == 200, switched.text
+    picture = client.get(f"{path}/image.svg")
+    assert picture.status_code == 200, picture.text
+    assert "No pose" in picture.text
+    assert "way driven" not in picture.text

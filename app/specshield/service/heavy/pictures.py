@@ -68,8 +68,8 @@ def draw_session(
 ) -> bytes:
     """The map, the regions, the way driven on this map, and the certified continuation of the last decision.
 
-    rows: the session's rows on this map. last: the record of step t, which is that of the last row, or b"".
-    known: what the session has learned of the map.
+    rows: the session's rows on this map, none before the first step there. last: the record of step t, which
+    is that of the last row, or b"". known: what the session has learned of the map.
     """
     about = Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
     task = policies_of(settings).task(about)
@@ -81,11 +81,13 @@ def draw_session(
     if decided is not None:
         pose, taken = (*rows[-1, :3].tolist(),), (decided.action, decided.completion_action)
         plan.way(way_ahead(applied(task.grid, known), task.robot, pose, *taken, witness), "next")
-    plan.way(rows[:, :3])
-    plan.robot(rows[-1, :3].tolist())
+    if len(rows):
+        plan.way(rows[:, :3])
+        plan.robot(rows[-1, :3].tolist())
     plan.line(str(task.formula), "ink formula")
     dashed = "" if witness is None else "; dashed: the certified continuation"
-    plan.line(f"{config['id']}, step {t}. The line is the way driven{dashed}.", "faint")
+    drawn = f"The line is the way driven{dashed}." if len(rows) else "No pose on this map is known yet."
+    plan.line(f"{config['id']}, step {t}. {drawn}", "faint")
     if len(known):
         plan.line("Unlike the map: violet cells were found occupied, faint ones free.", "faint")
     plan.line(f"The rule's last step is {rules.origin(config) + task.horizon}.", "faint")
