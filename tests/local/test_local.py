@@ -432,7 +432,7 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="radians"):  # as where a server is sent it
         LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False)
     for nothing in (tmp_path, tmp_path / "none.yaml", tmp_path / "house.json"):
-        with pytest.raises(MapError, match="no map can be read there"):
+        with pytest.raises(MapError, match="there is no such file"):
             LocalShield.make(nothing, "F[0,9] x > 1")
 
 

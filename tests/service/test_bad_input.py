@@ -389,7 +389,7 @@ def test_sessions(client, policy, unchanged, fields, type, path):
     body = {"policy_id": policy["id"], "initial_pose": START, **fields}
     told = problem(client.post("/v1/sessions", json=body), 422, type, path)
     if path == "id":  # in words, as of the other names
-        assert told["expected"].startswith("1 to 64 letters a to z, digits")
+        assert told["expected"].startswith("1 to 64 letters from A to Z or a to z, digits")
 
 
 def test_look_ahead_where_it_cannot_be_had(client, policy):
