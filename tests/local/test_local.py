@@ -431,9 +431,13 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
     (tmp_path / "floor.yaml").write_text(metadata.replace("[0.0, 0.0, 0.0]", "[0, 0, 90]"))
     with pytest.raises(MapError, match="radians"):  # as where a server is sent it
         LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False)
-    for nothing in (tmp_path, tmp_path / "none.yaml", tmp_path / "house.json"):
-        with pytest.raises(MapError, match="there is no such file"):
-            LocalShield.make(nothing, "F[0,9] x > 1")
+    for name, said in (
+        ("", "no map can be read"),
+        ("none.yaml", "no such file"),
+        ("house.json", "no map can be read"),
+    ):
+        with pytest.raises(MapError, match=said):
+            LocalShield.make(tmp_path / name, "F[0,9] x > 1")
 
 
 @pytest.mark.parametrize("card", [None, "", "[]", "{}", '{"robot": {}, "spec": []}'])
