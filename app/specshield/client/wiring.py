@@ -21,7 +21,7 @@ ENOUGH = 6  # [motions] that only the mistake explains; chosen by hand
 # noise of a robot (0.01 m and 0.5 degrees) and as much for its localisation.
 PART, FAR, TURNED = 0.3, 0.06, 0.05  # [m], [rad]
 MANY = 10  # [motions] strides, or turns, that are compared for a factor that they share; chosen by hand
-OFF = 0.3  # by how much that factor differs from 1 at least: a session learns of less by itself
+OFF = 0.3  # that factor differs from 1 by more: with less, a session's slack still suffices
 HELD = 0.3  # a robot whose motions are shorter than this share of what they should be is held by something
 LONGER = (
     "the robot's strides are {:.2g} times as long as its actions say; poses and `translate` are in metres"

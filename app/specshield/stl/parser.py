@@ -219,6 +219,7 @@ class _Parser:
         return Name(name)
 
     def _regions(self) -> str:
+        """What is valid where a region is meant, in words."""
         named = (nodes.region_named(name) for name in self._names or ())
         own = sorted({region for how, region in named if how is not None})
         return f"one of {', '.join(own[:20])}" if own else "a region or a room of the map; there are none"

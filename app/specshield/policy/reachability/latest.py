@@ -35,7 +35,7 @@ from specshield.robot.dynamics import motion_count
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
 MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop
 LEAST_LATE, MOST_LATE = -2, -6  # [steps] what `lateness` finds at least and at most
-HARDLY = 0.01  # the share of beams that find a way, up to which it is not worth to look for one
+HARDLY = 0.01  # no way is looked for where at most this share of the beams finds one; chosen by hand
 
 
 def masks_of(rules: Rules) -> list[int]:

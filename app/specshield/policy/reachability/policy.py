@@ -280,7 +280,7 @@ def _tables(
 
 
 def _late(task: Task, body: Body, rules: Rules, tables: Tables, beam: int) -> float:
-    """`Tables.late`, measured from as many poses as take about 0.1 s."""
+    """`Tables.late` [steps], measured from fewer poses for a robot of many motions: in 10 to 60 ms."""
     many = max(LATE_POSES * FEW_MOTIONS // max(len(task.robot.motions), FEW_MOTIONS), 1)
     try:
         poses = free_poses(task, body, many, np.random.default_rng(0))

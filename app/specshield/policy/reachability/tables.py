@@ -21,7 +21,7 @@ from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDIN
 from specshield.robot.dynamics import Body, unhindered
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
-LATE = -3.0  # [steps] `Tables.late` where it was not measured (lateness.py). Chosen by hand.
+LATE = -3.0  # [steps] `Tables.late` where it was not measured (latest.py). Chosen by hand.
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
 UNKNOWN = -1  # in place of how many corners there are about a place
 DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
@@ -36,8 +36,8 @@ class Tables(NamedTuple):
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
     settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: see stepwise.py; bits
     has no steps if the tables are latest times. early [steps]: by how much deadlines are to be met earlier
-    than the latest times were computed for. late [steps], negative: a slack with which ways are still looked
-    for, since the tables err.
+    than the latest times were computed for. late [steps]: the least slack with which ways are looked for. It is
+    negative, since the tables err.
     """
 
     cell: Int32s
