@@ -36,8 +36,8 @@ class Tables(NamedTuple):
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
     settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: see stepwise.py; bits
     has no steps if the tables are latest times. early [steps]: by how much deadlines are to be met earlier
-    than the latest times were computed for. late [steps]: the least slack with which ways are looked for. It is
-    negative, since the tables err.
+    than the latest times were computed for. late [steps]: the least slack with which ways are looked for. It
+    is negative, since the tables err.
     """
 
     cell: Int32s
