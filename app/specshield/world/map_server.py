@@ -29,6 +29,7 @@ MAX_YAML = 16_384  # characters; a map's YAML has some 150
 FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] a larger yaw is taken to be in degrees
 UNKNOWN = -1
 MODES = ("trinary", "scale", "raw")
+ROWS = 256  # that are read at once: the fractions of a whole map of 4,000 x 4,000 cells took 700 MB
 
 
 def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
@@ -53,18 +54,27 @@ def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
     if mode not in MODES:
         raise checks.wrong("mode", "mode", mode, "one of " + ", ".join(MODES))
 
-    shade, opacity = _read_image(image, alpha_counts=mode == "trinary")
-    occupancy = shade if negate else 1.0 - shade
+    pixels = _read_image(image)
+    values = np.empty(pixels.shape[:2], np.int8)
+    for row in range(0, len(pixels), ROWS):
+        band = slice(row, row + ROWS)
+        values[band] = _values(pixels[band], mode, bool(negate), free_thresh, occupied_thresh)
+    return from_values(values[::-1], resolution, (x, y, yaw))
+
+
+def _values(pixels: NDArray[Any], mode: str, negate: bool, free: float, occupied: float) -> NDArray[Any]:
+    """The values of pixels, from UNKNOWN to 100. free, occupied: the thresholds."""
+    shade, opacity = _shades(pixels, alpha_counts=mode == "trinary")
     if mode == "raw":
         values = np.floor(shade * 255 + 0.5)
         values[values > 100] = UNKNOWN
-    else:
-        between = np.rint((occupancy - free_thresh) / (occupied_thresh - free_thresh) * 100.0)
-        middle = between if mode == "scale" else UNKNOWN
-        values = np.where(occupancy > occupied_thresh, 100, np.where(occupancy < free_thresh, 0, middle))
-        if mode == "scale":
-            values[opacity < 1.0] = UNKNOWN
-    return from_values(values[::-1], resolution, (x, y, yaw))
+        return values
+    occupancy = shade if negate else 1.0 - shade
+    middle = np.rint((occupancy - free) / (occupied - free) * 100.0) if mode == "scale" else UNKNOWN
+    values = np.where(occupancy > occupied, 100, np.where(occupancy < free, 0, middle))
+    if mode == "scale":
+        values[opacity < 1.0] = UNKNOWN
+    return values
 
 
 def dump_map(grid: OccupancyGrid, image: str = "map.pgm") -> tuple[str, bytes]:
@@ -131,8 +141,10 @@ def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = che
     return checks.number(value, path, low, high)
 
 
-def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
-    """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
+def _read_image(image: bytes) -> NDArray[Any]:
+    """The pixels, [height, width] if grey, else [height, width, 3 or 4]; 8 bits are of the type uint8. The
+    size is checked before anything is decoded.
+    """
     got = f"{len(image)} bytes"
     try:
         picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])
@@ -147,18 +159,22 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
     check_size(*picture.size)
     try:
         if picture.mode[0] == "I":  # 16 bits
-            shade = np.asarray(picture, dtype=np.float64) / 65535
-            return shade, np.ones_like(shade)
+            return np.asarray(picture)
         if "A" in picture.mode or "transparency" in picture.info:
-            pixels = np.asarray(picture.convert("RGBA"))
-            return pixels[..., : 4 if alpha_counts else 3].mean(axis=-1) / 255, pixels[..., 3] / 255
-        grey = picture.mode in ("1", "L")
-        pixels = np.asarray(picture.convert("L" if grey else "RGB"))
-        shade = (pixels if grey else pixels.mean(axis=-1)) / 255
-        return shade, np.ones_like(shade)
+            return np.asarray(picture.convert("RGBA"))
+        return np.asarray(picture.convert("L" if picture.mode in ("1", "L") else "RGB"))
     except Exception as error:
         problem = "the image is broken or cut off"
         raise MapError(problem, path="image", got=got, expected="a whole PGM or PNG") from error
+
+
+def _shades(pixels: NDArray[Any], alpha_counts: bool) -> tuple[Floats, Floats]:
+    """(shade, opacity) of pixels, each in [0, 1]."""
+    if pixels.ndim == 2:
+        shade = pixels / (255 if pixels.dtype == np.uint8 else 65535)
+        return shade, np.ones_like(shade)
+    colours = pixels[..., : 4 if alpha_counts else 3].mean(axis=-1) / 255
+    return colours, pixels[..., 3] / 255 if pixels.shape[-1] == 4 else np.ones_like(colours)
 
 
 def text_of(metadata: bytes) -> str:
