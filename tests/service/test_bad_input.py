@@ -457,6 +457,18 @@ def test_steps(client, begin, step, fields, type, path):
     assert client.get(f"/v1/sessions/{session['id']}").json() == session
 
 
+def test_a_misspelt_field_is_told_before_the_one_that_is_missing_with_the_names_there_are(client, begin, step):
+    told = step(begin(), t=0, poses=[START], logit=LOGITS)
+    answer = problem(told, 422, "invalid-input", "logit")
+    assert answer["detail"] == "logit is not a field of this request"
+    assert {"t", "poses", "logits"} <= {*answer["expected"].removeprefix("one of ").split(", ")}
+    assert [error["path"] for error in answer["errors"]] == ["logit"]
+    nested = ask(robot={"footprint": {"radius": 0.2, "raduis": 1}, "actions": [{"nam": "wait"}]})
+    answer = problem(client.post("/v1/policies", json=nested), 422, "invalid-robot", "robot.footprint.raduis")
+    assert "radius" in answer["expected"]
+    assert "map_id" not in answer["expected"]
+
+
 def test_signals_that_are_no_object_are_told_so_in_the_words_of_json(begin, step):
     told = step(begin(), t=0, poses=[START], logits=LOGITS, signals=[1.0])
     assert problem(told, 422, "invalid-samples", "signals")["expected"] == "an object"

@@ -77,6 +77,11 @@ def test_what_was_sent_to_a_server_is_found_in_its_data_folder(server, client, b
     assert client.get("/v1/sessions/none/record").json()["type"] == "not-found"
 
 
+def test_where_a_policy_is_missing_the_options_that_name_folders_are_told(case1, capsys, tmp_path):
+    status, said = told(capsys, tmp_path, case1[0], models_dir=tmp_path)
+    assert (status, "--models-dir" in said, "/v1/" in said) == (2, True, False)
+
+
 def test_a_file_that_cannot_be_read_is_none_that_differs(case1, capsys, tmp_path):
     for unread in (tmp_path / "none", tmp_path):
         ended = run_specshield("verify", unread)

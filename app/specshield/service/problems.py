@@ -164,6 +164,7 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     found = [
         e for e in found if e["type"] != "literal_error" or not isinstance(e.get("input"), dict)
     ] or found
+    found = sorted(found, key=lambda e: e["type"] == "missing")  # perhaps since its name is misspelt: last
     listed = [
         {
             "path": ".".join(filter(None, (below, _path(item, body)[:200]))),
@@ -187,10 +188,13 @@ def _expected(item: Mapping[str, Any]) -> str:
     if item["type"].startswith("union_tag") and "expected_tags" in context:
         return f"one of {context['expected_tags']}"
     told = {
-        "extra_forbidden": "the fields that /docs lists",
         **dict.fromkeys(("missing", "union_tag_not_found"), "a value: this field is required"),
         **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "an object"),
-        "int_parsing": "a whole number",
+        **dict.fromkeys(("int_parsing", "int_type", "int_from_float"), "a whole number"),
+        **dict.fromkeys(("float_parsing", "float_type"), "a number"),
+        "bool_type": "true or false",
+        "string_type": "a text",
+        "list_type": "a list",
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
         "string_pattern_mismatch": "a text of the form {pattern}",

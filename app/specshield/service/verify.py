@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from specshield import __version__
-from specshield.errors import InputError, SpecshieldError
+from specshield.errors import InputError, NotFound, SpecshieldError
 from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.service.heavy.tables import Made, make
@@ -57,6 +57,9 @@ def verify(file: Path, settings: Settings) -> int:
     print(f"seal {found.seal}")
     try:
         shields, wrong = _shields(found, settings)
+    except NotFound as error:
+        print(f"NOT decided again: {error.message}; --data-dir, --models-dir and --maps-dir say where to look")
+        return 2
     except (SpecshieldError, OSError, TypeError) as error:  # or a record that no server made
         print(f"NOT decided again: {error}")
         return 2

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 SpecStatus = Literal["pending", "satisfied", "violated"]
 ID = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
@@ -22,6 +30,7 @@ Point = Annotated[
     Field(min_length=2, max_length=2, fail_fast=True, description="[x, y] in metres, map frame."),
 ]
 MOST_UNKNOWN = 20  # unknown fields that get an error each
+TOLD = {"extra_forbidden": "one of {known}", "too_many_fields": "no other fields than {known}"}  # what is valid
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
@@ -33,14 +42,26 @@ class Strict(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _few_unknown_fields(cls, value: Any) -> Any:
-        most = len(cls.model_fields) + MOST_UNKNOWN
-        if isinstance(value, dict) and len(value) > most:
-            known = ", ".join(cls.model_fields)
-            raise PydanticCustomError("too_many_fields", "no other fields than {known}", {"known": known})
-        return value
+    def _tell_known_fields(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        known = {"known": ", ".join(cls.model_fields)}
+        if isinstance(value, dict) and len(value) > len(cls.model_fields) + MOST_UNKNOWN:
+            raise PydanticCustomError("too_many_fields", TOLD["too_many_fields"], known)
+        try:
+            return validate(value)
+        except ValidationError as invalid:
+            found = [_with_known(item, known) for item in invalid.errors(include_url=False)]
+            raise ValidationError.from_exception_data(cls.__name__, found) from None
+
+
+def _with_known(item: ErrorDetails, known: dict[str, Any]) -> InitErrorDetails:
+    """The same error again. An unknown field's says which are known; one of a member's says so already."""
+    kind: Any = item["type"]
+    context = item.get("ctx", {})
+    if kind in TOLD:
+        kind = PydanticCustomError(kind, TOLD[kind], context or known)
+    return InitErrorDetails(type=kind, loc=item["loc"], input=item["input"], ctx=context)
 
 
 class FieldError(BaseModel):
