@@ -52,13 +52,13 @@ def test_a_corridor_by_hand():
     assert literal[2:] == [[turn, *[GO] * 9] for turn in (LEFT, RIGHT)]  # it goes against the wall
 
 
-def test_a_way_is_joined_only_where_that_comes_in_time():
+def test_where_no_way_comes_in_time_the_motion_is_undone_which_misses_the_least():
     policy, start = always_going("F[0,7] End"), (1.25, 0.75, 0.0)
     assert rows(policy, start) == [
         [WAIT, *[GO] * 6],
         [*[GO] * 6, WAIT],
-        [LEFT, *[GO] * 6],  # to turn back is a step too late, so this is the policy's own
-        [RIGHT, *[GO] * 6],
+        [LEFT, RIGHT, *[GO] * 5],  # a step too late; the policy's own would go ahead to where LEFT looks
+        [RIGHT, LEFT, *[GO] * 5],
     ]
 
 
@@ -130,9 +130,10 @@ def test_to_undo_a_motion_and_go_on_certifies_no_less_than_the_policy_itself():
         assert proposal.preferred == literal.preferred
         assert own[proposal.preferred]
         rho = [futures_robustness(policy, pose, each.motions) for each in (literal, proposal)]
-        assert (rho[1][~own] > 0.0).all()  # what is not the policy's own rollout satisfies
         assert (rho[1][own] == rho[0][own]).all()
-        retraced, more = retraced + (~own).sum(), more + (rho[0][~own] <= 0.0).sum()
+        kept = [each > 0.0 for each in rho]
+        assert (kept[1] | ~kept[0]).all()
+        retraced, more = retraced + (kept[1] & ~own).sum(), more + (kept[1] & ~kept[0]).sum()
     assert retraced > 50
     assert more > 10
 

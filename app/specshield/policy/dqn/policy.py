@@ -33,7 +33,8 @@ class Policy(Carded):
     """The greedy policy of a Q-network, pi_phi(x, t) = argmax_a Q(x, a, t), which also sees the progress.
 
     After the motion that it prefers, it proposes its own rollout. After another motion it proposes to undo
-    that motion and to go the same way, if that satisfies the formula, and else its own rollout too.
+    that motion and to go the same way, if that satisfies the formula or its own rollout does not either, and
+    else its own rollout.
     literal: its own rollout after every motion, as in the paper, which is slower, and J is 1 less often.
     """
 

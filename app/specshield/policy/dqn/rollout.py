@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins, is_same_pose, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
@@ -25,13 +25,21 @@ def _begin(rules: Rules, now: Present, state: State) -> None:
 
 @leaf
 def _follow(
-    scene: Scene, net: Network, layers: Layers, t: int, first: int, state: State, motions: Ints, poses: Floats
+    scene: Scene,
+    net: Network,
+    layers: Layers,
+    t: int,
+    first: int,
+    state: State,
+    motions: Ints,
+    poses: Floats,
+    whole: bool,
 ) -> int:
     """Follows pi_phi from `state` at step t to the horizon and returns the outcome there.
 
     first: the motion to begin with, -1 where pi_phi chooses that too. Writes motions (T - t,) and the pose
-    after each, poses (T - t, 3). A broken obligation does not end the rollout, since others may still be
-    kept. Once none is pending, a robot that can wait does.
+    after each, poses (T - t, 3). whole: a broken obligation does not end the rollout, since others may still
+    be kept. Once none is pending, a robot that can wait does.
     """
     known = False  # whether state.nexts are those from where the robot is
     for k in range(motions.shape[0]):
@@ -51,6 +59,8 @@ def _follow(
         known = not arrive(scene.rules, t + k + 1, x, y, theta, state) and known
         motions[k] = motion
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, theta
+        if not whole and BROKEN in state.status:
+            break
     return outcome(state.status)
 
 
@@ -88,8 +98,9 @@ def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: 
 
     Returns the motion that pi_phi itself takes. If `literal`, every row is pi_phi's own rollout after that
     motion. Otherwise, once some row settles everything, other first motions try to join it: from the same
-    place (policy/detour.py) or by undoing the motion. If neither settles everything, the row is pi_phi's own
-    rollout as well.
+    place (policy/detour.py) or by undoing the motion. If neither settles everything, pi_phi's own rollout is
+    tried. If that breaks the rule too, the row undoes its motion and joins the other way if it can: then it
+    misses the rule by a few steps only, while pi_phi often goes astray once it is late.
 
     undoing (M, 2): the motions that undo each, -1 for none.
     """
@@ -98,20 +109,20 @@ def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: 
     state, layers = make_state(scene, net.w1.shape[0]), make_layers(net)
     poses = np.empty((*motions.shape, 3))
     _begin(scene.rules, now, state)
-    _follow(scene, net, layers, t, -1, state, motions[0, :1], poses[0, :1])
+    _follow(scene, net, layers, t, -1, state, motions[0, :1], poses[0, :1], True)
     preferred, base, ways = motions[0, 0], -1, 0
     for m in range(motions.shape[0]):
         x, y, theta = step(scene.body, now.pose[0], now.pose[1], now.pose[2], m)
         motions[m, 0] = m
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
     twin, known = np.empty(motions.shape[0], np.int64), np.empty(motions.shape[0], np.int64)
-    sibling = np.empty(3, np.int64)
+    sibling, own = np.empty(3, np.int64), np.empty(motions.shape[1], np.int64)
     find_twins(poses, twin)
     for i in range(-1, motions.shape[0]):  # what pi_phi prefers comes first: others may join it
         m = twin[preferred if i < 0 else i]
         if i >= 0 and (m != i or m == twin[preferred]):
             continue
-        reached = PENDING
+        reached, joins = PENDING, False
         if base >= 0 and not literal:
             find_sibling(scene.body, poses, known[:ways], m, scene.wait >= 0, sibling)
             if sibling[0] >= 0:
@@ -120,15 +131,19 @@ def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: 
                 reached = _retrace(scene, t, state, motions[m], poses[m])
             if reached != SETTLED:
                 turn, move = undoing[m, 0], undoing[m, 1]
-                if is_same_pose(poses[m, 0], now.pose):  # contact held it: there is nothing to undo
+                stands = is_same_pose(poses[m, 0], now.pose)
+                if stands:  # it waits, or contact held it: there is nothing to undo
                     turn, move = -1, -1
+                joins = stands or turn >= 0 or move >= 0
                 join(turn, move, motions[base], 0, scene.wait, motions[m])
                 _begin(scene.rules, now, state)
                 reached = _retrace(scene, t, state, motions[m], poses[m])
         if reached != SETTLED:
             _begin(scene.rules, now, state)
-            reached = _follow(scene, net, layers, t, m, state, motions[m], poses[m])
+            row = own if joins else motions[m]
+            reached = _follow(scene, net, layers, t, m, state, row, poses[m], not joins)
             if reached == SETTLED:
+                copy_row(row, motions[m])
                 known[ways] = m
                 ways += 1
         if reached == SETTLED and base < 0:
@@ -156,7 +171,7 @@ def satisfies(scene: Scene, net: Network, starts: Floats, first: bool) -> Bools:
         advance(scene.rules, 0, state.predicates, status, run)
         for m in range(-1, motion_count(scene.body) if first else 0):
             _begin(scene.rules, now, state)
-            if _follow(scene, net, layers, 0, m, state, motions, poses) == SETTLED:
+            if _follow(scene, net, layers, 0, m, state, motions, poses, True) == SETTLED:
                 out[i] = True
                 break
     return out
