@@ -217,6 +217,24 @@ def test_what_the_service_does_answer_is_raised(outcome, error):
     assert state.t == 1
 
 
+def test_who_raises_is_told_how_to_pass_over_a_step_that_was_decided_after_all():
+    state = robust("raise")
+    for conflict in (problem(409, "step-conflict"), taken(0, 0.2)):
+        assert "session.record(pose)" in step(state, 0.0, conflict)[0].expected
+    other = problem(409, "step-conflict", path="main_task_done")
+    assert "session.record" not in str(step(state, 0.0, other)[0].expected)
+    state.record((0.2, 0, 0))
+    assert step(state, 0.4, decided(1, M))[0].t == 1
+
+
+def test_a_closed_session_notes_no_further_poses():
+    state = robust()
+    drive(state._end(), answer({"spec_status": "pending", "robustness_bounds": [None, None]}))
+    with pytest.raises(errors.SessionFinished):
+        state.record((0.2, 0, 0))
+    assert state.t == 0
+
+
 def test_bad_input_is_refused_also_while_the_service_is_away():
     state = robust()
     step(state, 0.0, decided(0, M, witness=[M, M]))

@@ -273,6 +273,8 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
     state = session()
     step(state, 0, decided(0, M))
     assert close(state, None, VERDICT)[1] == [{"t": 0, "poses": [[0, 0, 0]]}]
+    state = session()
+    step(state, 0, decided(0, M))
     state.record((1, 0, 0))
     state.record((2, 0, 0))
     bodies = close(state, None, problem(409, "history-gap", expected_t=0), VERDICT)[1]

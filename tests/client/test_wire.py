@@ -97,13 +97,31 @@ def test_float32_logits_keep_their_value():
 
 
 @pytest.mark.parametrize(
-    "bad", [[0.0, math.nan], [0.0, math.inf], [0.0, "x"], [[0.0, 1.0]], 3.0, {0: 5.0, 1: 7.0}, {0.0, 1.0}]
+    "bad",
+    [
+        [0.0, math.nan],
+        [0.0, math.inf],
+        [0.0, "x"],
+        [[0.0, 1.0]],
+        3.0,
+        {0: 5.0, 1: 7.0},
+        {0.0, 1.0},
+        ["0", "1"],
+        np.array(["1"]),
+        b"12",
+    ],
 )
 def test_bad_logits_are_refused_before_anything_is_sent(bad):
     with pytest.raises(errors.LogitsError) as caught:
         wire.logit_values(bad)
     assert caught.value.path.startswith("logits")
     assert caught.value.expected
+
+
+def test_logits_of_a_batch_are_told_so():
+    for batch in (np.zeros((1, 20)), [[0.0] * 20]):
+        with pytest.raises(errors.LogitsError, match="lists of numbers, as of a batch"):
+            wire.logit_values(batch)
 
 
 def test_the_path_of_a_bad_logit_is_the_servers():

@@ -462,6 +462,14 @@ def test_what_is_wrong_is_said() -> None:
         LocalShield.make(wall, "F[0,60] x > 5", robot=ROBOT).session(initial_pose=(1.5, 1.5, 0.0))
 
 
+@pytest.mark.parametrize("rule", ["F[0,10] 0 > 1", "G[0,10] 0 >= 0"])
+def test_a_rule_that_reads_nothing_and_does_not_hold_is_proved_to_fail(rule: str) -> None:
+    floor = OccupancyGrid(np.zeros((9, 9), bool), 1.0)
+    with pytest.raises(InfeasibleStart, match="reads neither poses nor signals") as caught:
+        LocalShield.make(floor, rule, robot=ROBOT).session(initial_pose=(4.0, 4.0, 0.0))
+    assert caught.value.details == {"proved": True, "conjuncts": []}
+
+
 def test_no_web_part_is_imported() -> None:
     code = "import specshield.local, specshield.client.models, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

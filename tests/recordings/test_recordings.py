@@ -273,6 +273,7 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     )
     assert run("export", "record", "--to", "csv", "--out", "b.csv") == "b.csv: 1 steps\n"
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    assert not (tmp_path / "data").exists()  # a command that reads leaves no folder behind
     assert run("export", "record", "--to", "mcap") == f"{session.id}.mcap: 1 steps\n"
     LocalShield.make(OccupancyGrid(np.zeros((30, 30), bool), 0.2), "F[0,9] x > 1").save(tmp_path / "room")
     files = [tmp_path / "room" / name for name in ("map.yaml", "map.pgm", "policy.safetensors", "card.json")]

@@ -457,7 +457,7 @@ def test_steps(client, begin, step, fields, type, path):
     assert client.get(f"/v1/sessions/{session['id']}").json() == session
 
 
-def test_a_misspelt_field_is_told_before_the_one_that_is_missing_with_the_names_there_are(client, begin, step):
+def test_a_misspelt_field_is_told_before_a_missing_one_with_the_names_there_are(client, begin, step):
     told = step(begin(), t=0, poses=[START], logit=LOGITS)
     answer = problem(told, 422, "invalid-input", "logit")
     assert answer["detail"] == "logit is not a field of this request"

@@ -37,6 +37,8 @@ def case1(server: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes,
                 decision = session.step(pose, random.normal(size=20), witnesses=t == 3)
                 pose = decision.next_poses[decision.execute]
             seal = session.save_record(file)
+            with pytest.raises(InputError, match="cannot be written: No such file or directory"):
+                session.save_record(file.parent / "none" / "record")
             session.close(pose)
             closed = session.save_record(file.with_suffix(".closed"))
     assert seal != closed

@@ -35,6 +35,7 @@ from specshield.client.wiring import Wiring
 from specshield.errors import (
     HistoryConflict,
     HistoryGap,
+    InputError,
     NotFound,
     SessionFinished,
     SpecshieldError,
@@ -97,7 +98,10 @@ class SessionState:
         """Note x_t of a step without a decision, as the service was away, and go on to step t + 1.
 
         If x_t is on the certified continuation, the robot is taken to run the continuation's next action.
+        Raises SessionFinished for a session that was closed.
         """
+        if self.closed:
+            raise SessionFinished("the session is closed", path="t", got=self.t, expected="a new session")
         self._poses[self.t] = wire.pose_values(pose)
         self._continuation.follow(self._poses[self.t])
         self.t += 1
@@ -145,7 +149,7 @@ class SessionState:
                 body[name] = wire.point_values(points, name)
         own = main_task_done is None
         if self.on_failure == "raise":
-            return (yield from self._decided(x_t, body, own, TRIES))
+            return (yield from self._ask(x_t, lambda x_t: self._decided(x_t, body, own, TRIES)))
         error: SpecshieldError | None = None
         if self._circuit.due:
             try:
@@ -186,20 +190,30 @@ class SessionState:
         next step.
         """
         x_t = None if pose is None else wire.pose_values(pose)
-        if self.on_failure == "raise":  # the error says what the service has, and the caller uses `record`
-            return (yield from asking(x_t))
+        if self.on_failure == "raise":
+            try:
+                return (yield from asking(x_t))
+            except SpecshieldError as error:
+                if self._has_step(error):
+                    error.expected = (
+                        f"{error.expected or 'a later step'}; session.record(pose) passes this one over"
+                    )
+                raise
         asked, self._unanswered = self._unanswered, self.t  # until an answer comes: the step may be cancelled
         try:
             return (yield from asking(x_t))
         except SpecshieldError as error:
             self._unanswered = self.t if is_away(error) else asked
-            stored = isinstance(error, HistoryConflict) and error.details.get("t") == self.t
-            taken = isinstance(error, StepConflict) and error.path != "main_task_done"
-            if asked != self.t or x_t is None or not (stored or taken):
+            if asked != self.t or x_t is None or not self._has_step(error):
                 raise
         self.record(x_t)
         self._stored = max(self._stored, self.t)
         return (yield from self._ask(x_t, asking))
+
+    def _has_step(self, error: SpecshieldError) -> bool:
+        """Whether this error says that the service has step t already, with another pose or other logits."""
+        stored = isinstance(error, HistoryConflict) and error.details.get("t") == self.t
+        return stored or (isinstance(error, StepConflict) and error.path != "main_task_done")
 
     def _decided(self, x_t: Pose | None, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], self._with(x_t)
@@ -304,7 +318,11 @@ class SessionState:
         With the seal you can check later that a record is this one.
         """
         reply = yield from fetch(wire.get("sessions", self.id, "record", slow=True))
-        Path(path).write_bytes(reply.content)
+        try:
+            Path(path).write_bytes(reply.content)
+        except OSError as error:
+            told, expected = f"{path} cannot be written: {error.strerror}", "a file in a folder that exists"
+            raise InputError(told, path="path", got=str(path), expected=expected) from None
         return reply.headers.get("x-record-seal", "")
 
     step = deciding(_step)

@@ -216,13 +216,26 @@ def seconds_value(seconds: object, name: str) -> float:
 
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
     """The values as floats. None becomes minus infinity among logits, and is an error elsewhere."""
-    listed = values.tolist() if hasattr(values, "tolist") else values
-    if isinstance(values, str | Mapping | Set):  # they can be iterated over, but are no ordered numbers
-        listed = [values]
+    listed = values
     try:
+        if isinstance(values, str | bytes | Mapping | Set):  # iterable, but no ordered numbers
+            raise TypeError
+        if hasattr(values, "tolist"):
+            listed = values.tolist()
+        elif not isinstance(values, list | tuple):
+            listed = list(values)
+        if any(isinstance(value, str | bytes) for value in listed):
+            raise TypeError
         return [-math.inf if value is None and error is LogitsError else float(value) for value in listed]
-    except (TypeError, ValueError, OverflowError) as cause:
-        raise error("these are not numbers", path=where, got=f"{listed!r:.80}", expected=expected) from cause
+    except (
+        TypeError,
+        ValueError,
+        OverflowError,
+        RuntimeError,
+    ) as cause:  # the last by tensors without values
+        nested = isinstance(listed, list | tuple) and any(isinstance(value, list | tuple) for value in listed)
+        told = "these are lists of numbers, as of a batch" if nested else "these are not numbers"
+        raise error(told, path=where, got=f"{listed!r:.80}", expected=expected) from cause
 
 
 _BY_TYPE = {cls.type: cls for cls in tree()}

@@ -158,7 +158,8 @@ def _store(settings: Settings) -> Iterator[Finding]:
             if folder.exists():
                 check_writable(folder, "SPECSHIELD_DATA_DIR")
         yield Finding("ok", "the store is the server's own, in the data folder")
-        open_objects(settings.files_at)
+        if settings.data_url is not None:
+            open_objects(settings.files_at)
         return
 
     began = time.perf_counter()

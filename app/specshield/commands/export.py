@@ -47,8 +47,8 @@ def export(
     rooms: Mapping[str, Region] = {}
     if file.is_file():
         found = chain.read(file.read_bytes())
-        with suppress(NotFound):
-            known = Maps(read_settings()).get(found.configs[0].map_id)
+        with suppress(NotFound), tempfile.TemporaryDirectory() as folder:
+            known = Maps(read_settings().or_empty(folder)).get(found.configs[0].map_id)
             grid, rooms = known.grid, known.rooms
     else:
         with ShieldClient(url, api_key, timeout=30.0) as client, tempfile.TemporaryDirectory() as folder:

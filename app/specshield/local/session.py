@@ -151,7 +151,12 @@ class LocalSession:
         return answer
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step without a decision, and go on to t + 1. An x_t that was given before counts."""
+        """Note x_t of a step without a decision, and go on to t + 1. An x_t that was given before counts.
+
+        Raises SessionFinished for a session that was closed.
+        """
+        if self.closed:
+            raise SessionFinished("the session is closed", path="t", got=self.t, expected="a new session")
         x_t = wire.pose_values(pose)
         self._arrived(self._given.get(self.t, x_t), self._held({}))
 

@@ -107,6 +107,9 @@ def refusal(
     history [t + 1, 3], signals {name: [t + 1]}, which are taken to keep their last values; sure: the robot on
     a map without guesses; what is proved is proved on that map.
     """
+    if not shield.task.formula.names:
+        said = "the rule reads neither poses nor signals, and its robustness is not above 0"
+        return Refusal(f"no way from here keeps the rule: {said}", True, ())
     relaxed = relaxations(shield, history, signals)
     if relaxed.way is not None:
         return Refusal(
@@ -128,8 +131,6 @@ def refusal(
 
 def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
     """What is wrong with the rule, in words. tried: how many ways were judged."""
-    if not conjuncts:
-        return "The rule reads neither poses nor signals, so no motion changes whether it is kept."
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
         alone = "Even with the rest of the rule left out, on" if len(conjuncts) > 1 else "On"

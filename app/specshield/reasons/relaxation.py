@@ -60,10 +60,10 @@ class Relaxed(NamedTuple):
 
 
 def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Relaxed:
-    """What of the rule cannot be kept after x_0..x_t, history [t + 1, 3], signals {name: [t + 1]}."""
+    """What of a rule that reads something cannot be kept after x_0..x_t, history [t + 1, 3], signals
+    {name: [t + 1]}.
+    """
     parts = conjuncts(shield.task.formula)
-    if not shield.task.formula.names:  # it reads nothing that any future could change
-        return Relaxed((), 0, None)
     gathered = _Gathered(shield, Known(shield.task, history, signals), parts)
     _gather(gathered)
     rho, late = np.concatenate(gathered.rho, axis=1), np.concatenate(gathered.late, axis=1)

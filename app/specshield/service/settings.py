@@ -207,6 +207,10 @@ class Settings(BaseSettings):
         """The folder, or the fsspec URL, of maps, policies and archived sessions."""
         return self.data_url or str(self.data_dir.resolve())
 
+    def or_empty(self, folder: str) -> Settings:
+        """These settings, with an empty folder where there is no data folder: who only reads makes none."""
+        return self if self.data_dir.is_dir() else self.model_copy(update={"data_dir": Path(folder)})
+
     def environment(self) -> dict[str, str]:
         """The environment that gives a child process these same settings."""
         values = {f"SPECSHIELD_{name.upper()}": value for name, value in self if value is not None}

@@ -58,7 +58,7 @@ def verify(file: Path, settings: Settings) -> int:
     try:
         shields, wrong = _shields(found, settings)
     except NotFound as error:
-        print(f"NOT decided again: {error.message}; --data-dir, --models-dir and --maps-dir say where to look")
+        print(f"NOT decided again: {error.message}; --data-dir, --models-dir and --maps-dir say where it is")
         return 2
     except (SpecshieldError, OSError, TypeError) as error:  # or a record that no server made
         print(f"NOT decided again: {error}")
@@ -143,9 +143,8 @@ def _again(
 
 def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[str]]]:
     """The shields that the server had, one for each rule, with `_unlike` of each. Raises SpecshieldError."""
-    with tempfile.TemporaryDirectory() as folder:  # so that no data folder is made if there is none
-        if not settings.data_dir.is_dir():
-            settings = settings.model_copy(update={"data_dir": Path(folder)})
+    with tempfile.TemporaryDirectory() as folder:
+        settings = settings.or_empty(folder)
         policies = Policies(settings, Maps(settings))
         last = len(found.rows) - 1
         starts = [found.rows[min(config.origin, last), :3].tolist() for config in found.configs]

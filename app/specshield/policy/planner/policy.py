@@ -22,10 +22,11 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Codes, Floats, Int32s
 from specshield.compiled import box
-from specshield.errors import PolicyError
+from specshield.errors import MapError, PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
+from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import INVALID, STEP_CODES, Lattice, make_lattice, number_cells, pose_of
+from specshield.policy.lattice import INVALID, STEP_CODES, make_lattice, number_cells
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import cost_of, foresee, is_open_if, make_bounds
@@ -202,22 +203,21 @@ class PlannerPolicy(Carded):
 
     def feasible_start(
         self,
-        lattice: Lattice,
         signals: Mapping[str, Floats] | None = None,
         on_progress: Callable[[float], None] = lambda done: None,
     ) -> float:
-        """The share of poses drawn from the lattice (the same each time) from which a plan was found.
+        """The share of poses drawn over free space (the same each time) from which a plan was found.
 
         signals {name: [1]}: held from x_0 on; else each has its initial value. on_progress: told the share
         of the poses that were tried.
         """
-        free, random = np.argwhere(lattice.valid == 1), np.random.default_rng(0)
-        if not len(free):
+        try:
+            poses = free_poses(self.task, self._body, STARTS, np.random.default_rng(0))
+        except MapError:  # next to no free space
             return 0.0
         begun = 0
-        for tried, i in enumerate(random.integers(len(free), size=STARTS), 1):
-            pose = pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
-            begun += self._plan(np.array([pose]), signals or {}, 0.0, ON)[1]
+        for tried, pose in enumerate(poses, 1):
+            begun += self._plan(pose.reshape(1, 3), signals or {}, 0.0, ON)[1]
             on_progress(tried / STARTS)
         return begun / STARTS
 
@@ -273,14 +273,12 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
     code = np.array(made, np.uint16).reshape(len(made), int(used.sum()), free.shape[2])
     # Trying it also leaves its kernels compiled where a server finds them.
     policy = PlannerPolicy(task, {}, settings, Fields(cell, code, pitch), chosen)
-    share = policy.feasible_start(
-        lattice, on_progress=lambda done: tell(FIELDS_SHARE + (1.0 - FIELDS_SHARE) * done)
-    )
+    share = policy.feasible_start(on_progress=lambda done: tell(FIELDS_SHARE + (1.0 - FIELDS_SHARE) * done))
     metrics = {"feasible_start": round(share, 4)}
     if task.signals:
         worst = worst_signals(task, task.formula)
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
-        share = policy.feasible_start(lattice, at_worst) if at_worst else 0.0
+        share = policy.feasible_start(at_worst) if at_worst else 0.0
         metrics["feasible_start_any_signal"] = round(share, 4)
     size, took = int(code.nbytes + cell.nbytes), round(time.perf_counter() - began, 3)
     metrics |= {"fields": len(made), "size_bytes": size, "wall_time_s": took}

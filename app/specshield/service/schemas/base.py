@@ -30,7 +30,8 @@ Point = Annotated[
     Field(min_length=2, max_length=2, fail_fast=True, description="[x, y] in metres, map frame."),
 ]
 MOST_UNKNOWN = 20  # unknown fields that get an error each
-TOLD = {"extra_forbidden": "one of {known}", "too_many_fields": "no other fields than {known}"}  # what is valid
+# What is valid, by the type of the error.
+TOLD = {"extra_forbidden": "one of {known}", "too_many_fields": "no other fields than {known}"}
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
