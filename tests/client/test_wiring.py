@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,8 +36,9 @@ def moved(pose, motion):
     return (pose[0] + along * math.cos(pose[2]), pose[1] + along * math.sin(pose[2]), pose[2] + turn)
 
 
-def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0):
-    """What is logged of a robot that executes `body` of each motion, and tells `frame` of its poses."""
+@cache
+def shield_for(steps):
+    """Which sessions do not change, so all tests of as many steps share it: to make it takes 0.1 s."""
     robot = {
         "footprint": {"radius": 0.2},
         "actions": [
@@ -46,7 +48,12 @@ def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0)
         ],
     }
     grid = OccupancyGrid(np.zeros((50, 50), bool), 0.2)
-    shield = LocalShield.make(grid, f"F[0,{steps + 50}] x > 1", robot=robot, check=False)
+    return LocalShield.make(grid, f"F[0,{steps + 50}] x > 1", robot=robot, check=False)
+
+
+def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0):
+    """What is logged of a robot that executes `body` of each motion, and tells `frame` of its poses."""
+    shield = shield_for(steps)
     random, poses = np.random.default_rng(seed), [START]
     caplog.clear()
     with caplog.at_level(logging.WARNING), shield.session(initial_pose=frame(poses), seed=seed) as session:
