@@ -24,7 +24,7 @@ from specshield.commands import doctor
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
-from tests.serving import free_port, run_specshield, serving, wait_for
+from tests.serving import HUNG, Forked, free_port, run_specshield, serving, wait_for
 from tests.stores import answers, running
 
 
@@ -72,18 +72,6 @@ def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
     assert "flat.json is no map of a known form" in line
-
-
-def test_a_map_of_another_packages_format_may_be_a_file(tmp_path):
-    """As the API takes it in JSON, with its `format`."""
-    added = Path(__file__).parents[1] / "registry_example"
-    path = os.pathsep.join([str(added), *filter(None, [os.environ.get("PYTHONPATH")])])
-    rows = ["#" * 30, *(["#" + "." * 28 + "#"] * 20), "#" * 30]
-    (tmp_path / "flat.json").write_text(json.dumps({"format": "drawing", "rows": rows}))
-    asked = ("--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 0.5", "--method", "ahead")
-    own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data"), "PYTHONPATH": path}
-    made = run_specshield("policy", *asked, "--out", tmp_path, **own)
-    assert "3.0 x 2.2 m at 0.1 m; rooms: Everywhere" in made.stdout, made.stderr
 
 
 @pytest.mark.parametrize(
@@ -194,26 +182,16 @@ def test_a_command_imports_what_it_needs(asked, tmp_path):
 def test_what_is_told_on_a_terminal_does_not_join_what_was_being_done(tmp_path):
     outer, inner = os.openpty()
     data = {**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
-    asked = (
-        "policy",
-        "--map",
-        "case2",
-        "--rule",
-        "F[0,9] x > 1",
-        "--method",
-        "guess",
-        "--out",
-        str(tmp_path),
-    )
-    with subprocess.Popen(
-        [sys.executable, "-m", "specshield.cli", *asked], env=data, stdout=inner, stderr=inner
-    ):
-        os.close(inner)
-        told = b""
-        with suppress(OSError):  # that is how a terminal ends
-            while piece := os.read(outer, 1024):
-                told += piece
+    asked = ["policy", "--map", "case2", "--rule", "F[0,9] x > 1", "--method", "guess", "--out", "."]
+    terminal = Path(os.ttyname(inner))
+    command = Forked(asked, data, stdout=terminal, stderr=terminal, cwd=tmp_path)
+    told = os.read(outer, 1024)
+    os.close(inner)  # by now the command has opened it itself
+    with suppress(OSError):  # that is how a terminal ends
+        while piece := os.read(outer, 1024):
+            told += piece
     os.close(outer)
+    command.wait(HUNG)
     lines = [line.rpartition("\x1b[K")[2].rstrip() for line in told.decode().split("\n") if line]
     assert [line[:14] for line in lines] == ["map     case2:", "rule    F[0,9]", "unknown method"]
 
