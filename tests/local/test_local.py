@@ -283,9 +283,8 @@ def test_where_a_robot_has_been_tells_nothing_of_another_map_nor_of_what_stops_a
 @pytest.mark.parametrize("learn_map", [True, False])
 @pytest.mark.parametrize("decided", [True, False], ids=["decided", "passed over"])
 def test_a_robot_that_was_taken_to_another_map_is_not_said_to_have_jumped(
-    small: LocalShield, learn_map: bool, decided: bool
+    small: LocalShield, other: LocalShield, learn_map: bool, decided: bool
 ) -> None:
-    other = LocalShield.make(OccupancyGrid(np.eye(30) > 0, 0.25), "F[0,40] x > 4", robot=ROBOT, check=False)
     session = small.session(initial_pose=(3.0, 3.0, 0.0), learn_map=learn_map)
     if decided:
         session.step((3.0, 3.0, 0.0), [0.0] * 4)
@@ -350,17 +349,24 @@ def test_a_pose_that_a_switch_told_stands_and_the_same_switch_again_is_the_one_m
         assert local.close() == remote.close()
 
 
-@pytest.mark.parametrize("clock", ["keep", "restart"])
-def test_a_switch_that_fails_leaves_everything_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Any
-) -> None:
-    """Whether it is refused, or something of it breaks at the very end."""
+@pytest.fixture(scope="module")
+def switched() -> tuple[LocalShield, ...]:
+    """What a session begins with, what it may switch to, and what it may not."""
     grid = LocalShield.shipped("case1").task.grid
     first, then = (
         LocalShield.make(grid, formula, signals={"battery": 9.0}, robot=ROBOT, check=False)
         for formula in ("F[0,90] x > 1 and G[0,90] battery > 1", "F[0,99] x > 1 and G[0,99] battery > 2")
     )
     wall = LocalShield.make(grid, "F[0,3] x > 9 and F[0,3] x < 1", robot=ROBOT, check=False)
+    return first, then, wall
+
+
+@pytest.mark.parametrize("clock", ["keep", "restart"])
+def test_a_switch_that_fails_leaves_everything_as_it_was(
+    switched: tuple[LocalShield, ...], monkeypatch: pytest.MonkeyPatch, clock: Any
+) -> None:
+    """Whether it is refused, or something of it breaks at the very end."""
+    first, then, wall = switched
     tried, plain = (first.session(initial_pose=START) for _ in range(2))
 
     def broken(*_: Any) -> bool:
@@ -521,6 +527,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 def small() -> LocalShield:
     grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
     return LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, check=False)
+
+
+@pytest.fixture(scope="module")
+def other() -> LocalShield:
+    return LocalShield.make(OccupancyGrid(np.eye(30) > 0, 0.25), "F[0,40] x > 4", robot=ROBOT, check=False)
 
 
 @pytest.mark.parametrize(("settings", "path"), WRONG, ids=str)
