@@ -15,7 +15,7 @@ import pytest
 
 from specshield.policy.planner.policy import Settings as Plan
 from specshield.policy.planner.policy import synthesise as plan
-from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.policy import Settings
 from specshield.robot import STRETCH, Action, Robot
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import in_collision, make_body, step
@@ -30,6 +30,7 @@ from specshield.shield.uncertainty import Care, Uncertainty
 from specshield.task import make_task
 from specshield.world.learned import CONTACT, SENT, LearnedMap, learn
 from specshield.world.occupancy import OccupancyGrid
+from tests.made import synthesise
 
 GOAL = {"type": "circle", "center": [3.5, 1.0], "radius": 0.4}
 START = (0.6, 1.0, 0.0)

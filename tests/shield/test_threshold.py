@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from specshield.local import LocalShield
-from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.shield.caution.experience import learn
 from specshield.shield.caution.threshold import MOST_SLIPS, _in_time, chances
@@ -19,6 +18,7 @@ from specshield.shield.proposal import Proposal
 from specshield.shield.uncertainty import Noise, Uncertainty
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.made import synthesise
 from tests.oracles.cells import FORWARD, WAIT, Cells, ways
 
 VECTORS = json.loads((Path(__file__).parents[1] / "oracles/storm/vectors.json").read_text())
@@ -40,7 +40,7 @@ class Everything:
 
 
 @pytest.mark.parametrize("formula", sorted({vector["formula"] for vector in VECTORS}))
-@pytest.mark.parametrize("make", [Everything, lambda cells: reachability.synthesise(cells.task)])
+@pytest.mark.parametrize("make", [Everything, lambda cells: synthesise(cells.task)])
 def test_v_is_never_above_what_the_best_policy_has(formula, make):
     found = []
     for vector in (v for v in VECTORS if v["formula"] == formula):
@@ -72,7 +72,7 @@ def test_v_is_never_above_what_the_best_policy_has(formula, make):
 def test_the_rule_is_kept_as_often_as_was_asked(asked, slip):
     cells = Cells(RULE, None, REGIONS)
     config = Config(threshold=asked, threshold_over="episode", uncertainty=Uncertainty(0.0, 0.0, slip))
-    shield, kept, runs = make_shield([reachability.synthesise(cells.task)], config), 0, 400
+    shield, kept, runs = make_shield([synthesise(cells.task)], config), 0, 400
     for run in range(runs):
         random, history, carry = np.random.default_rng(run), [cells.pose(0, 0, 0)], None
         shield = make_shield(shield.proposers, Config(**{**vars(config), "seed": run}))
