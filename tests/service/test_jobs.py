@@ -26,6 +26,8 @@ from tests.stores import DURABLE, answers, running
 pytest.importorskip("torch")
 
 LEARNING = Path(__file__).parents[1] / "learning_example"
+PATH = os.pathsep.join([str(LEARNING), *filter(None, [os.environ.get("PYTHONPATH")])])
+PATIENT = {"SPECSHIELD_WORKER": "true", "PYTHONPATH": PATH}
 TINY = {
     "updates": 20,
     "robots": 16,
@@ -46,9 +48,7 @@ SPEC = {
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
     """With a method that learns as SOON or LATER as a test wants, and needs no time of the processor."""
-    path = os.pathsep.join([str(LEARNING), *filter(None, [os.environ.get("PYTHONPATH")])])
-    folder = tmp_path_factory.mktemp("training")
-    with serving(folder, SPECSHIELD_WORKER="true", PYTHONPATH=path) as server:
+    with serving(tmp_path_factory.mktemp("training"), **PATIENT) as server:
         yield server
 
 
@@ -244,10 +244,10 @@ def orphaned(tmp_path):
 
         store, node = start(), stack.enter_context(redis.Redis(port=port))
         wait_for(lambda: answers(node))
-        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": f"redis://127.0.0.1:{port}"}
-        server = stack.enter_context(serving(tmp_path / "data", **training))
+        own = {**PATIENT, "REDIS_URL": f"redis://127.0.0.1:{port}"}
+        server = stack.enter_context(serving(tmp_path / "data", **own))
         client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
-        policy = ask(client, options=LONG)
+        policy = ask(client, **LATER)
         wait_for(lambda: read(client, policy)["eta_s"])
         (run,) = children(learner_of(server))
         store.terminate()
