@@ -217,7 +217,9 @@ def command_line(pid: int) -> str:
 
 
 def wait_for(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + HUNG
+    """Asks again after 50 ms, and less often the longer it takes: to ask may cost some ms of a processor."""
+    deadline, pause = time.monotonic() + HUNG, 0.05
     while not condition():
         assert time.monotonic() < deadline, f"not within {HUNG} s"
-        time.sleep(0.05)
+        time.sleep(pause)
+        pause = min(1.2 * pause, 0.25)
