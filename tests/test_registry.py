@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from specshield.client import ShieldClient
 from specshield.errors import InputError, Unsupported
 from specshield.registry import Registry
 from tests.service.world import LOGITS, ROBOT, SPEC, START, cells
-from tests.serving import HUNG, run_specshield, serving
+from tests.serving import HUNG, serving
 
 EXAMPLE = Path(__file__).parent / "registry_example"
 
@@ -59,17 +58,13 @@ def test_what_cannot_be_loaded_says_whose_it_is_and_nothing_of_the_inside(regist
     assert type(caught.value.__cause__).__name__ == cause
 
 
-@pytest.fixture(scope="module")
-def extended(tmp_path_factory):
-    """A server that finds the package of the example, and makes policies."""
-    path = os.pathsep.join([str(EXAMPLE), *filter(None, [os.environ.get("PYTHONPATH")])])
-    with serving(tmp_path_factory.mktemp("extended"), PYTHONPATH=path, SPECSHIELD_WORKER="true") as server:
-        yield server
-
-
-def test_a_method_a_format_and_a_preference_of_another_package_serve(extended):
+def test_a_method_a_format_and_a_preference_of_another_package_serve(tmp_path):
     """Over HTTP, made by a real worker: a map of its format, a policy of its method, its preference."""
-    with ShieldClient(extended.url, timeout=60.0) as client:
+    path = os.pathsep.join([str(EXAMPLE), *filter(None, [os.environ.get("PYTHONPATH")])])
+    with (
+        serving(tmp_path, PYTHONPATH=path, SPECSHIELD_WORKER="true") as server,
+        ShieldClient(server.url, timeout=60.0) as client,
+    ):
         rows = ["".join("#" if occupied else "." for occupied in row) for row in cells()[::-1]]
         room = client.maps.create(format="drawing", rows=rows)
         assert (room.width, room.height, list(room.rooms)) == (40, 30, ["Everywhere"])
@@ -92,16 +87,7 @@ def test_a_method_a_format_and_a_preference_of_another_package_serve(extended):
             np.testing.assert_allclose(eager.distribution, weighed / weighed.sum(), atol=1e-12)
             pose = eager.next_poses[0]
 
-        described = httpx.get(f"{extended.url}/openapi.json", timeout=None, verify=False).text
+        described = httpx.get(f"{server.url}/openapi.json", timeout=None, verify=False).text
         for name in ("ahead", "drawing", "eager"):
             assert f'"{name}"' in described
         assert "Repeats one motion, whatever the rule." in described
-
-
-def test_a_map_of_another_packages_format_may_be_a_file(extended, tmp_path):
-    """As the API takes it in JSON, with its `format`."""
-    rows = ["#" * 30, *(["#" + "." * 28 + "#"] * 20), "#" * 30]
-    (tmp_path / "flat.json").write_text(json.dumps({"format": "drawing", "rows": rows}))
-    asked = ("--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 0.5", "--method", "ahead")
-    made = run_specshield("policy", *asked, "--out", tmp_path, "--url", extended.url)
-    assert "3.0 x 2.2 m at 0.1 m; rooms: Everywhere" in made.stdout, made.stderr
