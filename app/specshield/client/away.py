@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from specshield.client.models import Decision, Pose
-from specshield.errors import InputError, LimitReached, SpecshieldError, TransportError
+from specshield.errors import (
+    HistoryConflict,
+    InputError,
+    LimitReached,
+    SpecshieldError,
+    StepConflict,
+    TransportError,
+)
 
 OnFailure = Literal["raise", "witness", "stop"]
 NEAR = 0.05  # [m] that a robot may be off the foreseen pose, beyond the session's margin; chosen by hand
@@ -31,6 +38,12 @@ def is_away(error: SpecshieldError) -> bool:
     """Whether the error means that the service cannot answer now, rather than that the request is wrong."""
     status = error.details.get("status")
     return isinstance(error, TransportError | LimitReached) or (isinstance(status, int) and status >= 500)
+
+
+def is_taken(error: SpecshieldError, t: int) -> bool:
+    """Whether the error says that the service has step t already, with another pose or other logits."""
+    stored = isinstance(error, HistoryConflict) and error.details.get("t") == t
+    return stored or (isinstance(error, StepConflict) and error.path != "main_task_done")
 
 
 @dataclass

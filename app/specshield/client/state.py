@@ -7,11 +7,10 @@ import os
 from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
-from pathlib import Path
 from typing import Any, Literal
 
 from specshield.client import wire
-from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
+from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away, is_taken
 from specshield.client.calls import policies_asked
 from specshield.client.core import Flow, T, Within, call, deliver, fetch
 from specshield.client.events import Events
@@ -32,15 +31,7 @@ from specshield.client.models import (
 from specshield.client.resources import deciding, stepping
 from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
 from specshield.client.wiring import Wiring
-from specshield.errors import (
-    HistoryConflict,
-    HistoryGap,
-    InputError,
-    NotFound,
-    SessionFinished,
-    SpecshieldError,
-    StepConflict,
-)
+from specshield.errors import HistoryConflict, HistoryGap, NotFound, SessionFinished, SpecshieldError
 
 
 class SessionState:
@@ -190,30 +181,23 @@ class SessionState:
         next step.
         """
         x_t = None if pose is None else wire.pose_values(pose)
-        if self.on_failure == "raise":
-            try:
-                return (yield from asking(x_t))
-            except SpecshieldError as error:
-                if self._has_step(error):
-                    error.expected = (
-                        f"{error.expected or 'a later step'}; session.record(pose) passes this one over"
-                    )
-                raise
-        asked, self._unanswered = self._unanswered, self.t  # until an answer comes: the step may be cancelled
+        asked, raises = self._unanswered, self.on_failure == "raise"
+        if not raises:
+            self._unanswered = self.t  # until an answer comes: the step may be cancelled
         try:
             return (yield from asking(x_t))
         except SpecshieldError as error:
-            self._unanswered = self.t if is_away(error) else asked
-            if asked != self.t or x_t is None or not self._has_step(error):
+            if not is_away(error):
+                self._unanswered = asked
+            taken = is_taken(error, self.t)
+            if taken and raises:
+                instead = "session.record(pose) passes this one over"
+                error.expected = f"{error.expected or 'a later step'}; {instead}"
+            if raises or not taken or asked != self.t or x_t is None:
                 raise
         self.record(x_t)
         self._stored = max(self._stored, self.t)
         return (yield from self._ask(x_t, asking))
-
-    def _has_step(self, error: SpecshieldError) -> bool:
-        """Whether this error says that the service has step t already, with another pose or other logits."""
-        stored = isinstance(error, HistoryConflict) and error.details.get("t") == self.t
-        return stored or (isinstance(error, StepConflict) and error.path != "main_task_done")
 
     def _decided(self, x_t: Pose | None, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], self._with(x_t)
@@ -318,11 +302,7 @@ class SessionState:
         With the seal you can check later that a record is this one.
         """
         reply = yield from fetch(wire.get("sessions", self.id, "record", slow=True))
-        try:
-            Path(path).write_bytes(reply.content)
-        except OSError as error:
-            told, expected = f"{path} cannot be written: {error.strerror}", "a file in a folder that exists"
-            raise InputError(told, path="path", got=str(path), expected=expected) from None
+        wire.write_file(path, reply.content)
         return reply.headers.get("x-record-seal", "")
 
     step = deciding(_step)

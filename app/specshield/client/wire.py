@@ -198,6 +198,15 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     }
 
 
+def write_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Raises InputError for a file that cannot be written."""
+    try:
+        Path(path).write_bytes(content)
+    except OSError as error:
+        told, expected = f"{path} cannot be written: {error.strerror}", "a file in a folder that exists"
+        raise InputError(told, path="path", got=str(path), expected=expected) from None
+
+
 def check_flags(**flags: object) -> None:
     """Raises InputError unless each is True, False or None."""
     for name, flag in flags.items():
