@@ -6,11 +6,16 @@ import gc
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from evaluation.shipped import shipped
 from specshield.shield.episode import Shield, make_shield
 from specshield.sim.cases import Case, case_names, load_case
 from tests.serving import RunningServer, serving
+
+# How long an example takes depends on what else the machine does.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 # What is imported from here on stays. To look for garbage in it takes a sixth of a collection's time.
 gc.disable()

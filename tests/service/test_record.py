@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 import redis
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from specshield.client import ShieldClient
@@ -114,7 +114,6 @@ def expected(decision, every, explain):
     return told
 
 
-@settings(deadline=None)
 @given(decisions())
 def test_a_record_reads_back_to_the_last_bit_and_answers_in_the_same_bytes(made):
     decision, row, asked = made

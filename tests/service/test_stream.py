@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 from websockets.asyncio.client import connect as aconnect
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
 from specshield.client import ShieldClient
@@ -283,7 +283,8 @@ def test_a_server_that_stops_ends_a_stream_after_the_step_that_it_is_deciding(tm
 
 
 def test_a_stream_that_is_being_opened_when_the_server_stops_ends_too(tmp_path):
-    """The store stands still while the session is looked for. uvicorn may refuse it before it is open."""
+    """The store stands still while the session is looked for. On a busy machine it may come so late
+    that it is refused."""
     with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         client.post("/v1/maps", json=grid_json())
         asked = {"policy_id": send_policy(client)["id"], "initial_pose": START}
@@ -297,7 +298,7 @@ def test_a_stream_that_is_being_opened_when_the_server_stops_ends_too(tmp_path):
                 client.get("/livez")
             server.process.send_signal(signal.SIGTERM)
             store.resume()
-            with suppress(InvalidStatus), opened.result() as stream:
+            with suppress(InvalidHandshake, OSError), opened.result() as stream:
                 with pytest.raises(ConnectionClosed) as closed:
                     stream.recv()
                 assert closed.value.rcvd.code == 1001
@@ -318,7 +319,7 @@ FIELDS = ("t", "poses", "logits", "main_task_done", "signals", "witnesses", "spe
 VALID = {"t": 1, "poses": [[1, 1.5, 0.0]], "logits": [0.5, None, 2], "signals": {"battery": 5}}
 
 
-@settings(deadline=None, max_examples=500)
+@settings(max_examples=500)
 @given(
     st.dictionaries(
         st.sampled_from(FIELDS), VALUES | st.dictionaries(st.sampled_from("ab"), SCALARS), max_size=2

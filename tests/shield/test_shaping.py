@@ -56,7 +56,7 @@ def check_optimal(answer, prior, values, threshold):
 logits = st.lists(st.floats(-4.0, 4.0), min_size=2, max_size=6)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.data())
 def test_closed_forms_are_the_optimum(data):
     log_prior = log_softmax(np.array(data.draw(logits)))

@@ -52,7 +52,7 @@ def test_the_target_is_seen_near_ahead_and_in_the_open(target, theta, expected):
     assert (distance, bearing) == pytest.approx(expected or (0.0, 0.0))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.floats(0.3, 7.7), st.floats(0.3, 3.7), st.floats(-3.1, 3.1),
     st.floats(-50.0, 50.0), st.floats(-50.0, 50.0), st.floats(-3.1, 3.1),

@@ -46,7 +46,7 @@ def test_by_hand(text: str, prefix: list[float], lo: float, hi: float) -> None:
 ANY_TERM = terms(finite, operators="+-*/")
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=250)
 @given(st.data())
 def test_sound_monotone_and_tight_in_the_end(data: st.DataObject) -> None:
     """Along any trajectory the bounds close in on its robustness and the verdict never takes itself back."""

@@ -29,7 +29,7 @@ def test_conjuncts(text: str, expected: list[str]) -> None:
     assert [str(part) for part in conjuncts(parse(text))] == expected
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data())
 def test_the_conjuncts_together_have_the_formulas_robustness(data: st.DataObject) -> None:
     formula = data.draw(formulas())

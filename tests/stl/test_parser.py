@@ -93,7 +93,7 @@ def test_horizon(text: str, horizon: int) -> None:
     assert parse(text).horizon == horizon
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(formulas(terms(finite), max_leaves=8))
 def test_print_and_parse_are_inverse(formula: object) -> None:
     assert parse(str(formula)) == formula
@@ -232,7 +232,7 @@ def test_hostile_text_is_a_formula_error(text: str) -> None:
     assert len(str(caught.value)) < 300
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.text("abxFGU[]()0123,:.<>=-+*/!&| e", max_size=40) | st.text(max_size=20))
 def test_any_text_is_a_formula_or_a_formula_error(text: str) -> None:
     try:

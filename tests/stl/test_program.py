@@ -14,7 +14,7 @@ SLOTS = {name: i for i, name in enumerate(NAMES)}
 STACK = np.empty(STACK_SIZE)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(predicates(terms(finite)), st.lists(finite, min_size=len(NAMES), max_size=len(NAMES)))
 def test_equal_to_robustness_bit_for_bit(predicate: Formula, values: list[float]) -> None:
     state = np.array(values)

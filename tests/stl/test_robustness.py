@@ -47,7 +47,7 @@ def test_by_hand(text: str, rho: float) -> None:
     assert robustness(parse(text), {"a": A, "b": B}) == rho
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_agrees_with_the_definition(data: st.DataObject) -> None:
     formula = data.draw(formulas())

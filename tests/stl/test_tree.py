@@ -34,7 +34,7 @@ def run(
     return *tree_bounds(tree, low, high), whole
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(formulas(max_leaves=8), traces(LENGTH), st.integers(1, LENGTH), st.booleans())
 def test_equal_to_the_evaluator_bit_for_bit(
     formula: Formula, samples: dict[str, list[float]], known: int, ahead: bool

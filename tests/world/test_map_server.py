@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
@@ -101,7 +101,6 @@ def test_a_yaw_in_degrees_is_refused_where_a_map_is_sent():
     assert load_map(*dump_map(grid)) == grid
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(
     arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=12)),
     st.floats(1e-3, 50),

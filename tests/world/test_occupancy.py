@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
@@ -24,7 +24,6 @@ def nearest_obstacle(occupied, row, column):
     return best
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(SMALL)
 def test_clearance_is_the_distance_to_the_nearest_square_or_the_outside(occupied):
     clearance = OccupancyGrid(occupied, 0.2).clearance
@@ -45,7 +44,6 @@ def test_clearance_by_hand():
     assert clearance[0, 0] == 0.5  # to the edge of the map
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(SMALL, YAW, arrays(float, (5, 2), elements=st.floats(-100, 100)))
 def test_frames_are_inverse_and_rigid(occupied, yaw, points):
     grid = OccupancyGrid(occupied, 0.05, (3.0, -2.0, yaw))

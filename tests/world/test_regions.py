@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from specshield.errors import MapError
@@ -68,7 +68,6 @@ def test_signed_distance_by_hand(region, point, expected):
     assert signed_distance(region, point) == pytest.approx(expected, abs=1e-12)
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(stars(), POINT)
 def test_polygons_against_points_along_the_boundary_and_the_winding_number(polygon, point):
     vertices = np.array(polygon.vertices)
@@ -85,7 +84,6 @@ def test_polygons_against_points_along_the_boundary_and_the_winding_number(polyg
         assert (found > 0) == (abs(turns) > 0.5)
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(REGION, POINT, st.floats(0, 2 * math.pi), st.floats(0, 5))
 def test_moving_by_d_changes_the_distance_by_at_most_d(region, point, angle, d):
     moved = (point[0] + d * math.cos(angle), point[1] + d * math.sin(angle))
@@ -93,7 +91,6 @@ def test_moving_by_d_changes_the_distance_by_at_most_d(region, point, angle, d):
     assert abs(first - second) <= d + 1e-9
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(st.lists(REGION, min_size=1, max_size=4), POINT)
 def test_packed_regions_give_the_very_same_numbers(regions, point):
     packed = pack_areas([Area(region) for region in regions])
@@ -105,7 +102,6 @@ FOOTPRINT = 0.01 * np.stack(np.meshgrid(np.arange(-100, 101), np.arange(-100, 10
 DISC = FOOTPRINT[np.hypot(*FOOTPRINT.T) <= 1.0]  # points of the unit disc, at most 0.01 apart on either axis
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(SIMPLE, POINT, st.floats(-3, 3), st.floats(0.1, 2.0), st.tuples(st.floats(-1, 1), st.floats(-1, 1)))
 def test_a_body_against_the_points_of_its_footprint(region, point, theta, radius, offset):
     """Each point of the footprint by itself says whether the body touches the region, or lies inside it."""
@@ -122,7 +118,6 @@ def test_a_body_against_the_points_of_its_footprint(region, point, theta, radius
     assert (inside > 0) == (depths.min() > 0) or abs(inside) <= near
 
 
-@settings(deadline=None)  # numba compiles on the first call
 @given(REGION)
 def test_json_round_trip(region):
     assert region_from_json(region_to_json(region), "r") == region

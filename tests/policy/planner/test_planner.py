@@ -148,7 +148,7 @@ def test_once_feasible_always_feasible(cells):
     assert played >= 3
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(formula=formulas(), robot=st.sampled_from([STRETCH, CUSTOM, RESTLESS]), data=st.data())
 def test_any_formula_has_a_proposal_for_every_motion(formula, robot, data):
     """Whatever is asked for, whatever the robot: rows for the shield, and what it certifies is so."""

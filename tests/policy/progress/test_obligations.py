@@ -75,7 +75,7 @@ def _formula(o: Obligation) -> Formula:
     return (Always if o.kind == "always" else Eventually)(o.a, o.b, o.predicate)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_the_obligations_together_have_the_formulas_robustness(data: st.DataObject) -> None:
     formula = data.draw(formulas())
