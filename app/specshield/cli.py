@@ -136,8 +136,9 @@ def serve(
             gc.disable()  # modules are never freed; `startup.prepare` enables collections again
             from specshield.service.app import create_app
     joined.result()  # raises the error of a store that does not start
-    if not insecure:
-        _check_exposure(host, settings)
+    if not insecure and _is_exposed(host, settings):
+        os.environ["SPECSHIELD_ASK_FOR_KEY"] = "true"  # for the server's processes, whenever they start
+        settings = settings.model_copy(update={"ask_for_key": True})
     with contextlib.suppress(StoreError):  # the store may be away now and come later
         check_files(settings.store_url, settings.files_at, settings.store_timeout)
     options: dict[str, Any] = {
@@ -270,13 +271,13 @@ def _check_address(host: str, port: int) -> None:
         ) from None
 
 
-def _check_exposure(host: str, settings: Settings) -> None:
-    """Raises InputError if anybody on the network could use the server."""
+def _is_exposed(host: str, settings: Settings) -> bool:
+    """Whether other machines reach the server. Raises InputError if anybody on them could use it."""
     from specshield.service.access.commands import on_keys
     from specshield.service.access.site import is_loopback
 
-    exposed = not is_loopback(host) and settings.api_key is None
-    if exposed and not on_keys(lambda keys: keys.listed(), settings):
+    exposed = not is_loopback(host)
+    if exposed and settings.api_key is None and not on_keys(lambda keys: keys.listed(), settings):
         raise InputError(
             f"whoever reaches {host} reaches this server, and it has no key to ask for",
             path="--host",
@@ -284,6 +285,7 @@ def _check_exposure(host: str, settings: Settings) -> None:
             expected="a key, by `specshield keys create` or SPECSHIELD_API_KEY; or an address that only this "
             "machine reaches, such as 127.0.0.1; or --insecure, if a proxy decides who may use the server",
         )
+    return exposed
 
 
 def _settings() -> Settings:

@@ -77,6 +77,10 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "0 unless REDIS_URL is set",
         ),
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
+        *(
+            ("serve", {"REDIS_URL": url}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0")
+            for url in ("redis:/127.0.0.1:6379/0", "redis://h/0?protocol=9", "redis://h/prod")
+        ),
         (
             "serve",
             {"REDIS_URL": "redis://h/0?ssl_cacerts=/etc/ca.pem"},

@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
-from specshield.service.access.keys import MISS_EVERY, REFRESH, Key, Keys
+from specshield.service.access.keys import MISS_EVERY, OPEN, REFRESH, Key, Keys
 from specshield.service.access.rates import Rates
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
@@ -226,6 +226,7 @@ def test_a_key_keeps_no_more_sessions_than_it_may(keyed):
     with caller(keyed, "small", sessions=1) as small:
         assert begin(small, id="one").status_code == 201
         problem(begin(small, id="two"), 429, "limit-reached")
+        problem(begin(small, id="one"), 409, "session-exists")  # as after an answer that was lost
         assert small.delete("/v1/sessions/one").status_code == 204
         assert begin(small, id="two").status_code == 201
 
@@ -328,6 +329,36 @@ def test_unknown_keys_do_not_ask_the_store_each():
     asyncio.run(try_many())
     assert asked <= 2
     assert REFRESH <= 2.0  # as the help of `keys revoke` says
+
+
+class Empty:
+    """A store without a key, which counts how often it is asked."""
+
+    asked = 0
+
+    async def hget(self, key, field):
+        self.asked += 1
+
+
+def test_a_header_costs_an_open_server_one_look_at_the_store():
+    """As of a proxy that has its own keys: with each look, the request would wait for MISS_EVERY."""
+
+    async def try_often():
+        keys = Keys(store := Empty())
+        for _ in range(100):
+            assert await keys.check(b"Basic eA==") == await keys.check(b"Bearer x") == OPEN
+        return store.asked
+
+    assert asyncio.run(try_often()) <= 2
+
+
+def test_a_server_that_others_reach_stays_closed_though_its_store_was_emptied():
+    async def try_once(given):
+        with pytest.raises(Unauthorized):
+            await Keys(Empty(), always=True).check(given)
+
+    for given in (b"", b"Bearer x"):
+        asyncio.run(try_once(given))
 
 
 def test_keys_are_followed_on_when_a_connection_is_lost_at_the_moment_at_which_the_store_is_asked():

@@ -13,6 +13,7 @@ import httpx
 import pytest
 
 from specshield.errors import InputError
+from specshield.service.leaving import ECHO
 from specshield.service.library.files import Kept
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
@@ -32,7 +33,7 @@ def test_a_server_that_is_told_to_stop_says_so_first_and_goes_on_meanwhile(tmp_p
         assert client.post("/v1/maps", json=grid_json()).status_code == 201
         policy = send_policy(client)
         session = client.post("/v1/sessions", json={"policy_id": policy["id"], "initial_pose": START}).json()
-        os.kill(server.process.pid, signal.SIGTERM)
+        tell_all(server)  # as systemd does; a supervisor then tells its workers once more
 
         def stopping() -> bool:
             ready = client.get("/readyz")
@@ -42,9 +43,14 @@ def test_a_server_that_is_told_to_stop_says_so_first_and_goes_on_meanwhile(tmp_p
         body = {"t": 0, "poses": ahead(0)[-1:], "logits": LOGITS}
         assert client.post(f"/v1/sessions/{session['id']}/steps", json=body).status_code == 200
         assert server.process.poll() is None
-        for process in processes(server):  # a second time: it stops at once
-            os.kill(process, signal.SIGTERM)
+        time.sleep(ECHO)
+        tell_all(server)  # a second time: it stops at once
         assert server.process.wait(HUNG) == 0
+
+
+def tell_all(server: RunningServer) -> None:
+    for process in {server.process.pid, *processes(server)}:
+        os.kill(process, signal.SIGTERM)
 
 
 def processes(server: RunningServer) -> list[int]:

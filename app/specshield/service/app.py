@@ -132,7 +132,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     sessions = Sessions(settings, store, known, heavy, watchers.decided, startup.has)
     steps = sessions.steps
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
-    keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
+    keys, gauges = Keys(store.redis, own, settings.ask_for_key), Gauges(store, jobs)
     server = Server(
         settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys
     )

@@ -5,8 +5,10 @@ stops and closes its streams. Also, how uvicorn's supervisor notices that a work
 from __future__ import annotations
 
 import asyncio
+import math
 import signal
 import threading
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,7 @@ from uvicorn.supervisors.multiprocess import Process
 if TYPE_CHECKING:  # the parent of several servers does not need it
     from specshield.service.startup import Startup
 
+ECHO = 1.0  # [s] if a whole group is told to stop, as by systemd, the supervisor tells its workers once more
 GRACE = 10  # [s] for running requests and streams once the server takes no new ones; chosen by hand
 
 
@@ -45,15 +48,17 @@ class Streams:
 def drain_at_sigterm(startup: Startup, seconds: float) -> None:
     """After SIGTERM, /readyz answers 503 and everything else goes on; `seconds` later the server stops.
 
-    A second SIGTERM, or SIGINT, stops it at once. To be called in the server's event loop.
+    A second SIGTERM after ECHO, or SIGINT, stops it at once. To be called in the server's event loop.
     """
-    loop = asyncio.get_running_loop()
+    loop, first = asyncio.get_running_loop(), math.inf
 
     def told(stop: Callable[[], object]) -> None:
+        nonlocal first
         again, startup.stopping = startup.stopping, True
-        if again or seconds <= 0:
+        if seconds <= 0 or time.monotonic() - first > ECHO:
             stop()
-        else:
+        elif not again:
+            first = time.monotonic()
             loop.call_soon_threadsafe(loop.call_later, seconds, stop)
 
     _tell(told, signal.SIGTERM)

@@ -14,7 +14,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from specshield import shipped
 from specshield.errors import InputError
 from specshield.service.access.site import AUTHORITY
-from specshield.service.storage.connect import FORMS, connect, is_cluster
+from specshield.service.storage.connect import FAILURES, FORMS, connect, is_cluster
 from specshield.service.storage.embedded import EmbeddedStore
 
 LONGEST = 24 * 3600  # [s], the most for times to wait: timers do not take every number
@@ -51,6 +51,11 @@ class Settings(BaseSettings):
     )
     api_key: SecretStr | None = Field(
         None, description="A key, for `Authorization: Bearer <key>`, beside those of `specshield keys`."
+    )
+    ask_for_key: bool = Field(
+        False,
+        description="Whether a server refuses everybody, rather than nobody, while its store has no key. "
+        "`serve` sets it where other machines reach the server.",
     )
     allowed_hosts: str = Field(
         "",
@@ -109,7 +114,9 @@ class Settings(BaseSettings):
     )
     max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
     max_policies: int = Field(1000, ge=1, description="Most policies kept.")
-    max_sessions: int = Field(100_000, ge=1, description="Most sessions kept.")
+    max_sessions: int = Field(
+        100_000, ge=1, description="Most sessions in the store; those in the archive do not count."
+    )
     session_ttl: int = Field(
         7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
     )
@@ -167,7 +174,7 @@ class Settings(BaseSettings):
             store = connect(url) if url is not None else None
             if store is not None and not is_cluster(str(url)):
                 store.connection_pool.make_connection()  # checks all options, and opens nothing yet
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, *FAILURES):  # the last for a `protocol` that there is not
             raise ValueError(f"a URL as {FORMS}") from None
         return url
 

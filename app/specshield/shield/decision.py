@@ -20,6 +20,7 @@ from specshield.task import Task
 
 Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
 Reason = Literal["infeasible", "zero_prior_mass", "margin_unattainable"]
+USUAL_STEPS = 600  # that a session has at least, unless it says a number. Chosen by hand.
 ThresholdOver = Literal["step", "episode"]
 
 
@@ -94,7 +95,7 @@ class Shield:
 
     @property
     def max_steps(self) -> int:
-        return self.config.max_steps or max(600, self.task.horizon + 1)
+        return self.config.max_steps or max(USUAL_STEPS, self.task.horizon + 1)
 
 
 def check_preferring(config: Config) -> None:

@@ -32,6 +32,7 @@ REVOKE = "return redis.call('HDEL', KEYS[1], ARGV[1]) > 0 and redis.call('HSET',
 MOST_KEYS = 1000  # each takes some 300 bytes of every server's memory; chosen by hand
 REFRESH = 2.0  # [s] for which a revoked key may still work; chosen by hand
 MISS_EVERY = 0.2  # [s] between two looks at the store for unknown keys, at least; chosen by hand
+MOST_STRANGE = 1000  # unknown keys that an open server remembers; chosen by hand
 log = logging.getLogger("specshield")
 
 
@@ -53,14 +54,16 @@ class Key:
 
 class Keys:
     """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits, unless the store has the
-    same key (a command that starts a server may use one). store: a client of redis.asyncio.
+    same key (a command that starts a server may use one). store: a client of redis.asyncio. always: a key is
+    asked for even if the store has none, as after it was emptied.
     """
 
-    def __init__(self, store: Any, own: str | None = None) -> None:
+    def __init__(self, store: Any, own: str | None = None, always: bool = False) -> None:
         self._store, self._lock = store, asyncio.Lock()
         self._own = {} if own is None else {digest_of(own.encode()): Key("", digest_of(own.encode()))}
         self._known: Mapping[str, Key] = self._own
         self._version: bytes | None = None
+        self._always, self._strange = always, set[str]()  # the digests that an open server did not find
         self._read, self._tried_at = False, -math.inf
         self._changed = asyncio.Event()
 
@@ -72,11 +75,15 @@ class Keys:
         # Looking up the digest takes a time that tells nothing about the key.
         digest = digest_of(given.strip()) if scheme.lower() == b"bearer" else ""
         found = self._known.get(digest)
-        if found is None and (given or not self._read):
+        if found is None and digest not in self._strange and (given or not self._read):
             await self.refresh()
             found = self._known.get(digest)
         if found is None:
-            if self._read and not self._own and self._version is None:
+            if self._read and not (self._own or self._always) and self._version is None:
+                if given:  # to look again at each request would hold each for MISS_EVERY
+                    self._strange = (
+                        {digest} if len(self._strange) >= MOST_STRANGE else self._strange | {digest}
+                    )
                 return OPEN
             if not (self._read or self._own):
                 raise StoreError("the store cannot be reached, so the API keys are not known yet")
@@ -109,6 +116,7 @@ class Keys:
                 if version is not None and version != self._version:
                     listed = {key.digest: key for key in await self.listed()}
                     self._known, self._version = {**self._own, **listed}, version
+                    self._strange.clear()
                     self._changed.set()
                     self._changed = asyncio.Event()
                 self._read = True

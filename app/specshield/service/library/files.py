@@ -99,8 +99,12 @@ def check_free(folder: Path, wanted: int) -> None:
     except OSError as error:
         raise unusable(error) from error
     if free < wanted:
-        expected = f"at least {wanted} free bytes: delete something"
-        raise InsufficientStorage("the server's disk is full", got=free, expected=expected)
+        expected = (
+            f"at least {wanted} free bytes with what SPECSHIELD_DISK_RESERVE_BYTES keeps: delete something"
+        )
+        raise InsufficientStorage(
+            "the server's disk is full but for its reserve", got=free, expected=expected
+        )
 
 
 def page(

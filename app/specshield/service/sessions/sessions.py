@@ -47,9 +47,9 @@ from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
-from specshield.service.storage.store import Change, Limit, no_more
+from specshield.service.storage.store import Change, Limit, exists, no_more
 from specshield.shield import episode
-from specshield.shield.decision import Config, check_preferring
+from specshield.shield.decision import USUAL_STEPS, Config, check_preferring
 from specshield.shield.preference import Preference
 from specshield.shield.signals import any_signal
 from specshield.world.learned import LearnedMap
@@ -81,7 +81,13 @@ class Sessions:
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
-        limits = await self._check_room(key)
+        try:
+            limits = await self._check_room(key)
+        except LimitReached:  # not for a session that was made by an earlier try whose answer was lost
+            id = scoped(key.name, request.id or "")
+            if request.id is not None and await self._store.load(id) is not None:
+                raise exists(id) from None
+            raise
         if self._settings.redis_url is None:  # the embedded store writes to this disk
             files.check_free(self._settings.data_dir, self._settings.disk_reserve_bytes)
         settings = self._checked(request)
@@ -120,6 +126,8 @@ class Sessions:
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
         check_shaping(request.shaping)
         config = asked_for(request)
+        if config.max_steps is None and self._settings.max_steps < USUAL_STEPS:
+            config = replace(config, max_steps=self._settings.max_steps)
         if request.shaping != PROJECTION:
             check_preferring(config)
         return config

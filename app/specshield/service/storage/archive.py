@@ -105,12 +105,12 @@ class Archive:
     def remove(self, entry: Entry) -> None:
         self._objects.remove(entry.path)
 
-    def erase(self, key: str) -> bool:
-        """Removes all files of a session. False if there was none."""
-        found = self.entries(key)
-        for entry in found:
+    def erase(self, key: str) -> int:
+        """Removes all files of a session. Returns their bytes, 0 if there was none."""
+        size = sum(size for _, size in self._objects.sizes(_folder(key)))
+        for entry in self.entries(key):
             self.remove(entry)
-        return bool(found)
+        return size
 
     def after(self, owner: str, id: str | None) -> Iterator[Entry]:
         """The latest file of each session of an owner that has not expired, in order of id, after this id."""

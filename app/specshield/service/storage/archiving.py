@@ -112,7 +112,9 @@ class ArchivingStore(Store):
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.take_off([id.encode()])
-        return bool(await self.in_thread(self.archive.erase, id)) or bool(found)
+        if size := await self.in_thread(self.archive.erase, id):
+            await self.count_bytes(-size)
+        return bool(size or found)
 
     async def everything(
         self, owner: str, after: str | None, limit: int

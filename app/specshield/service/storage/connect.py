@@ -97,6 +97,9 @@ def connect(url: str, blocking: bool = False, **options: Any) -> Any:
     retry = kit.retry.Retry(ExponentialBackoff(cap=0.2, base=0.02), TRIES, **only)
     options = {"retry": retry, "socket_connect_timeout": options.get("socket_timeout"), **options}
     if not kind:
+        parts = urlsplit(url)
+        if "://" not in url or (parts.scheme != "unix" and parts.path.strip("/").strip("0123456789")):
+            raise ValueError("no such form, or a database that is no number: redis-py would take database 0")
         pool: Any = kit.BlockingConnectionPool if not blocking else kit.ConnectionPool
         waits = {"max_connections": CONNECTIONS, "timeout": options.get("socket_timeout")}
         return kit.Redis.from_pool(pool.from_url(url, **options, **({} if blocking else waits)))
