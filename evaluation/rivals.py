@@ -102,6 +102,7 @@ def verdict(found: Found, limit: int) -> list[str]:
     later = compared(
         [pair for each in found.values() for pair in _pairs(each, "lookahead", best_steps, "steps", limit)]
     )
+    kept = _met(within >= SINGLE * len(alone)) if alone else "nothing to judge"
     parts = [
         f"- KL in sum: look-ahead's is {_ratio(kl, best_kl, beside)} of the "
         f"best slack's, `{best_kl}`; at most {KL_SHARE:g} is asked: "
@@ -109,7 +110,7 @@ def verdict(found: Found, limit: int) -> list[str]:
         f"- Steps in sum: look-ahead's are {_ratio(steps, best_steps, later)} of those of the best slack, "
         f"`{best_steps}`; at most 1 is asked: {_met(steps['lookahead'] <= steps[best_steps])}.",
         f"- Single runs in which projection's KL is below {HARDLY:g}: look-ahead's is at most {ADDED:g} nat "
-        f"more in {said}; {100 * SINGLE:g} % is asked: {_met(within >= SINGLE * len(alone) > 0)}{why}.",
+        f"more in {said}; {100 * SINGLE:g} % is asked: {kept}{why}.",
     ]
     return ["## What was asked of look-ahead before these runs", "\n".join(parts)]
 

@@ -468,6 +468,12 @@ def test_what_is_wrong_is_said() -> None:
         LocalShield.make(wall, "F[0,60] x > 5", robot=ROBOT).session(initial_pose=(1.5, 1.5, 0.0))
 
 
+def test_what_is_no_world_is_told_by_its_type() -> None:
+    cells: Any = np.zeros((20, 20), bool)
+    with pytest.raises(MapError, match="this is no world; got 'a ndarray'; expected an OccupancyGrid"):
+        LocalShield.make(cells, "F[0,9] x > 1")
+
+
 @pytest.mark.parametrize("rule", ["F[0,10] 0 > 1", "G[0,10] 0 >= 0"])
 def test_a_rule_that_reads_nothing_and_does_not_hold_is_proved_to_fail(rule: str) -> None:
     floor = OccupancyGrid(np.zeros((9, 9), bool), 1.0)

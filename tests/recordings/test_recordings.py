@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,11 @@ def test_parquet_holds_the_same(recording: Recording, tmp_path: Path) -> None:
     assert table.schema.metadata[b"formula"].startswith(b"F[0,60]")
     assert table["theta"].to_pylist() == [item.pose[2] for item in recording.items]
     assert table["p_m"].to_pylist()[12] is None
+    silent = replace(recording, items=[replace(item, decision=None) for item in recording.items])
+    write_parquet(silent, tmp_path / "silent.parquet")  # a column that is empty all through keeps its type
+    both = parquet.read_table([tmp_path / "s.parquet", tmp_path / "silent.parquet"])
+    assert both.num_rows == 2 * table.num_rows
+    assert both.schema.types == table.schema.types
 
 
 def test_mcap_opens_with_the_schemas_of_foxglove(recording: Recording, tmp_path: Path) -> None:

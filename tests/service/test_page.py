@@ -234,8 +234,8 @@ def test_a_rule_over_a_signal_is_written_and_made(small, browse):
         rule.fill("F[0,20] Dock and G[0,20] battery > 10")
         page.get_by_text("nothing declares 'battery'").wait_for()
         signals.fill("battery = 9e1; call=0")
+        page.get_by_text("steps 0 to 20").first.wait_for()  # as it is written, before the field is left
         signals.press("Enter")
-        page.get_by_text("steps 0 to 20").first.wait_for()
         wrong = page.locator(".signals .wrong")
         for text, why in (
             ("battery", '"battery" is not a name, = and a number'),

@@ -200,11 +200,14 @@ class LocalShield:
         return prepare(name, self.task, self.shield.proposers, [*grid.centres[row, column], 0.0])
 
 
-def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
-    """A map and its named areas."""
+def _read_world(world: object) -> tuple[OccupancyGrid, Mapping[str, Region]]:
+    """A map and its named areas. Raises MapError for what is no `World`."""
     if isinstance(world, OccupancyGrid):
         return world, {}
     if isinstance(world, Mapping):
         members = plain(world)
         return read_map(members.pop("format", None), members)
-    return read_map_files(Path(world if isinstance(world, os.PathLike) else str(world)))
+    if not isinstance(world, str | os.PathLike):
+        expected = "an OccupancyGrid, the path of a map's YAML, or a map as the API takes it"
+        raise MapError("this is no world", path="world", got=f"a {type(world).__name__}", expected=expected)
+    return read_map_files(Path(world))

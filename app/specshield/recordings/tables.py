@@ -12,6 +12,9 @@ TOLD = (
     "mode", "action", "action_name", "completion_action", "spec_status", "feasible_mass", "kl", "reason",
     "margin", "slack", "threshold_left", "map_revision", "finished", "in_collision",
 )  # fmt: skip
+TEXTS = {"mode", "action_name", "spec_status", "reason"}
+WHOLE = {"t", "action", "completion_action", "slack", "map_revision"}
+FLAGS = {"finished", "in_collision"}  # all other columns are fractions
 
 
 def rows(recording: Recording) -> list[dict[str, Any]]:
@@ -48,6 +51,11 @@ def write_parquet(recording: Recording, path: Path) -> None:
     import pyarrow as arrow
     from pyarrow import parquet
 
-    table = arrow.Table.from_pylist(rows(recording))
+    found = rows(recording)
+    kinds = ((TEXTS, arrow.string()), (WHOLE, arrow.int64()), (FLAGS, arrow.bool_()))
+    # By name, since a column may be empty all through: tables of several sessions are to fit together.
+    kind = {name: kind for names, kind in kinds for name in names}
+    schema = arrow.schema([(name, kind.get(name, arrow.float64())) for name in found[0]])
+    table = arrow.Table.from_pylist(found, schema=schema)
     about = {"session": recording.id, "formula": recording.formula, "actions": ",".join(recording.actions)}
     parquet.write_table(table.replace_schema_metadata(about), path)

@@ -7,15 +7,17 @@ export class Signals {
   /** signals: by name; changed: called when they are others. places: gives the names of regions and rooms. */
   constructor(signals, places, changed) {
     Object.assign(this, { signals, places, changed });
-    this.input = el("input", { value: written(signals), placeholder: "battery = 90, call = 0", spellcheck: "false", autocomplete: "off", onchange: () => this.read() });
+    this.input = el("input", { value: written(signals), placeholder: "battery = 90, call = 0", spellcheck: "false", autocomplete: "off", oninput: () => this.read(false), onchange: () => this.read(true) });
     this.wrong = el("p", { class: "wrong", role: "alert" });
     const label = el("label", {}, "Signals, and what they hold until the robot sends them ", this.input);
     this.element = el("div", { class: "signals" }, label, this.wrong);
   }
 
-  read() {
+  /** done: whether all is written; before that, what cannot be taken yet is not told. */
+  read(done) {
     const found = Object.create(null);
     const why = this.input.value.split(/[,;\n]/).filter((part) => part.trim()).map((part) => this.take(part, found)).find(Boolean) ?? "";
+    if (why && !done) return;
     const kept = written(this.signals);
     this.input.setAttribute("aria-invalid", String(why !== ""));
     this.wrong.textContent = why && `${why}. The rule still has ${kept ? `the signals ${kept}` : "no signals"}.`;
