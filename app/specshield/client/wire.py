@@ -236,12 +236,7 @@ def _floats(values: Any, error: type[InputError], where: str, expected: str) -> 
         if any(isinstance(value, str | bytes) for value in listed):
             raise TypeError
         return [-math.inf if value is None and error is LogitsError else float(value) for value in listed]
-    except (
-        TypeError,
-        ValueError,
-        OverflowError,
-        RuntimeError,
-    ) as cause:  # the last by tensors without values
+    except (TypeError, ValueError, OverflowError, RuntimeError) as cause:  # the last: tensors without values
         nested = isinstance(listed, list | tuple) and any(isinstance(value, list | tuple) for value in listed)
         told = "these are lists of numbers, as of a batch" if nested else "these are not numbers"
         raise error(told, path=where, got=f"{listed!r:.80}", expected=expected) from cause

@@ -48,7 +48,7 @@ class Streams:
 def drain_at_sigterm(startup: Startup, seconds: float) -> None:
     """After SIGTERM, /readyz answers 503 and everything else goes on; `seconds` later the server stops.
 
-    A second SIGTERM after ECHO, or SIGINT, stops it at once. To be called in the server's event loop.
+    SIGINT, or a SIGTERM more than ECHO later, stops it at once. To be called in the server's event loop.
     """
     loop, first = asyncio.get_running_loop(), math.inf
 

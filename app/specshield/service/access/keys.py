@@ -81,9 +81,9 @@ class Keys:
         if found is None:
             if self._read and not (self._own or self._always) and self._version is None:
                 if given:  # to look again at each request would hold each for MISS_EVERY
-                    self._strange = (
-                        {digest} if len(self._strange) >= MOST_STRANGE else self._strange | {digest}
-                    )
+                    if len(self._strange) >= MOST_STRANGE:
+                        self._strange.clear()
+                    self._strange.add(digest)
                 return OPEN
             if not (self._read or self._own):
                 raise StoreError("the store cannot be reached, so the API keys are not known yet")
