@@ -240,6 +240,22 @@ def test_a_key_keeps_no_more_sessions_than_it_may_though_they_begin_at_once(keye
         assert len(kept) == 2
 
 
+def test_a_key_whose_sessions_fill_its_part_of_the_archive_begins_none(tmp_path):
+    settings = {"SPECSHIELD_ARCHIVE_AFTER": "1", "SPECSHIELD_MAX_OWNER_ARCHIVE_BYTES": "1"}
+    with (
+        serving(tmp_path / "data", SPECSHIELD_API_KEY="operator", **settings) as server,
+        caller(server, "gina") as gina,
+        caller(server, "hal") as hal,
+    ):
+        wait_for(lambda: begin(gina).status_code == 429)
+        found = problem(begin(gina), 429, "limit-reached")
+        assert "this key's sessions in the archive take" in found["detail"]
+        assert begin(hal).status_code == 201
+        for session in gina.get("/v1/sessions").json()["items"]:
+            assert gina.delete(f"/v1/sessions/{session['id']}").status_code == 204
+        wait_for(lambda: begin(gina).status_code == 201)
+
+
 def test_the_rate_of_a_key_leaves_its_robots_room(keyed):
     with caller(keyed, "busy", requests=0.1) as busy:
         with httpx.Client(base_url=keyed.url, verify=False, headers=busy.headers, timeout=None) as client:

@@ -131,6 +131,11 @@ class Settings(BaseSettings):
         ge=1 << 20,
         description="Once the archive has so many bytes, no session moves there and none is begun [bytes].",
     )
+    max_owner_archive_bytes: int = Field(
+        50 << 30,
+        ge=1,
+        description="Once one key's sessions take so many bytes of the archive, it can begin none [bytes].",
+    )
     drain: float = Field(
         0.0,
         ge=0,

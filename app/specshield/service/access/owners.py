@@ -20,6 +20,11 @@ def scoped(owner: str, id: str) -> str:
     return f"{owner}@{id}"
 
 
+def owner_of(key: str) -> str:
+    """The owner in a session's key."""
+    return key.partition("@")[0]
+
+
 def shown(key: str) -> str:
     """The id, as callers know it, in a session's key."""
     return key.partition("@")[2]

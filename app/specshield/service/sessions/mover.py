@@ -11,9 +11,11 @@ import asyncio
 import logging
 import secrets
 import time
+from collections import Counter
 from itertools import islice
 
 from specshield.errors import SpecshieldError
+from specshield.service.access.owners import owner_of
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
@@ -27,7 +29,7 @@ log = logging.getLogger("specshield")
 
 
 class Mover:
-    """While the archive is full, no session is moved, and `ArchivingStore.full` is true."""
+    """While the archive is full, no session is moved."""
 
     def __init__(self, store: ArchivingStore, settings: Settings) -> None:
         self._store, self._after, self._ttl = store, settings.archive_after, settings.session_ttl
@@ -41,9 +43,9 @@ class Mover:
             try:
                 mine = await self._store.my_turn("turn", self._me, int(3 * every) + 1)
                 if mine and await self._store.my_turn("sweep", secrets.token_hex(8), sweep_every):
-                    await self._store.count_bytes(await self.sweep() - await self._store.count_bytes())
-                self._store.full = await self._store.count_bytes() >= self._room
-                if mine and not self._store.full:
+                    await self._store.correct(await self.sweep())
+                self._store.archived = await self._store.sizes()
+                if mine and sum(self._store.archived.values()) < self._room:
                     await self.move()
             except SpecshieldError as error:
                 log.warning("nothing moves to the archive now: %s", error)
@@ -69,9 +71,11 @@ class Mover:
                 return False
             return await self._store.put_away(id, State.of(dump.state).expires_at, dump)
 
-    async def sweep(self) -> int:
-        """Removes files that have expired and those that a newer one replaces. Returns the bytes left."""
-        files, kept, total = self._store.archive.sizes(), None, 0
+    async def sweep(self) -> Counter[str]:
+        """Removes files that have expired and those that a newer one replaces. Returns the bytes that are
+        left, by owner.
+        """
+        files, kept, left = self._store.archive.sizes(), None, Counter[str]()
         while batch := await self._store.in_thread(lambda: list(islice(files, BATCH))):
             for entry, size in batch:
                 if entry.expires <= time.time():
@@ -79,5 +83,6 @@ class Mover:
                     continue
                 if kept is not None and (kept.key, kept.beginning) == (entry.key, entry.beginning):
                     await self._store.in_thread(self._store.archive.remove, kept)
-                kept, total = entry, total + size
-        return total
+                kept = entry
+                left[owner_of(entry.key)] += size
+        return left

@@ -235,10 +235,16 @@ class Sessions:
 
     async def _check_room(self, key: Key) -> list[Limit]:
         """The limits on the number of sessions that apply to a caller. Raises LimitReached."""
-        if self._store.full:
-            told = f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions"
-            expected = "room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES"
-            raise LimitReached(told, expected=expected)
+        archived = self._store.archived
+        for whose, size, setting in (
+            ("this key's", archived.get(key.name, 0), "max_owner_archive_bytes"),
+            ("all", sum(archived.values()), "archive_bytes"),
+        ):
+            if size >= (most := getattr(self._settings, setting)):
+                told = f"{whose} sessions in the archive take {size} of {most} bytes, so none can begin"
+                variable = f"SPECSHIELD_{setting.upper()}"
+                expected = f"room: delete sessions there; the server's operator can raise {variable}"
+                raise LimitReached(told, expected=expected)
         both = ((None, self._settings.max_sessions), (key.name, key.sessions))
         limits: list[Limit] = [(owner, most) for owner, most in both if most is not None]
         for owner, most in limits:

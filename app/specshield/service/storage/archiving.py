@@ -12,20 +12,20 @@ Two copies of a session never both go on, whatever process is killed and when:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import islice
 from typing import ParamSpec, TypeVar
 
 import anyio
 
-from specshield.service.access.owners import scoped
+from specshield.service.access.owners import owner_of, scoped
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, exists, keys
 
 P = ParamSpec("P")
 R = TypeVar("R")
 TURN = "specshield:archive:"  # followed by the work: the name of the server whose turn it is
-SIZE = "specshield:archive:bytes"
+SIZES = "specshield:archive:sizes"  # a hash: the bytes of each owner's files
 FENCE = 600  # [s]; longer than any server takes from reading a file to bringing it back. Chosen by hand.
 TRIES = 5  # of reading a file that a newer one replaces, and of bringing a session back
 AT_ONCE = 8  # reads and writes of files of one server process; more would wait for the same disk
@@ -66,18 +66,20 @@ if (redis.call('GET', KEYS[1]) or ARGV[1]) ~= ARGV[1] then return 0 end
 redis.call('PERSIST', KEYS[1])
 redis.call('SET', KEYS[1], ARGV[1], 'EX', ARGV[2])
 return 1"""
-COUNT = "redis.call('PERSIST', KEYS[1]) return redis.call('INCRBY', KEYS[1], ARGV[1])"
+COUNT = "redis.call('PERSIST', KEYS[1]) return redis.call('HINCRBY', KEYS[1], ARGV[1], ARGV[2])"
 
 
 class ArchivingStore(Store):
-    """A `Store` whose sessions may also lie in the archive. `count` counts only those in the store."""
+    """A `Store` whose sessions may also lie in the archive. `count` counts only those in the store. archived:
+    the bytes of each owner's files there, as the mover last read them.
+    """
 
     def __init__(self, url: str, timeout: float, ttl: int, archive: Archive, replicas: int = 0) -> None:
         super().__init__(url, timeout, ttl, replicas)
         self.archive = archive
         made = map(self.redis.register_script, (LEAVE, RETURN, ERASE, TAKE, COUNT))
         self._leave, self._return, self._erase, self._take, self._count = made
-        self.full = False
+        self.archived: dict[str, int] = {}
         self._files = anyio.CapacityLimiter(AT_ONCE)
 
     async def create(self, id: str, config: bytes, change: Change, *limits: tuple[str | None, int]) -> bytes:
@@ -113,7 +115,8 @@ class ArchivingStore(Store):
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.take_off([id.encode()])
         if size := await self.in_thread(self.archive.erase, id):
-            await self.count_bytes(-size)
+            await self.count_bytes(owner_of(id), -size)
+        await self.follow()
         return bool(size or found)
 
     async def everything(
@@ -173,10 +176,21 @@ class ArchivingStore(Store):
         async with self._reaching():
             return bool(await self._take(keys=[TURN + what], args=[name, seconds]))
 
-    async def count_bytes(self, more: int = 0) -> int:
-        """Adds `more` to the bytes of the archive and returns them: the last count plus what moved since."""
+    async def count_bytes(self, owner: str, more: int) -> None:
+        """Adds `more` to the bytes that an owner has in the archive."""
         async with self._reaching():
-            return int(await self._count(keys=[SIZE], args=[more]))
+            await self._count(keys=[SIZES], args=[owner, more])
+
+    async def sizes(self) -> dict[str, int]:
+        """The bytes that each owner has in the archive: those of the last count, and what moved since."""
+        async with self._reaching():
+            return {owner.decode(): int(size) for owner, size in (await self.redis.hgetall(SIZES)).items()}
+
+    async def correct(self, sizes: Mapping[str, int]) -> None:
+        """Makes these the bytes that each owner has in the archive."""
+        counted = await self.sizes()
+        for owner in counted.keys() | sizes.keys():
+            await self.count_bytes(owner, sizes.get(owner, 0) - counted.get(owner, 0))
 
     async def put_away(self, id: str, expires: float, dump: Dump) -> bool:
         """Moves a session to the archive. False if the store has a newer version, or it was erased."""
@@ -185,7 +199,7 @@ class ArchivingStore(Store):
             left = await self._leave(keys=_keys(id), args=[dump.version, FENCE])
             if left > 0:
                 await self.take_off([id.encode()])
-        await self.count_bytes(size)
+        await self.count_bytes(owner_of(id), size)
         if left > 0:
             for other in await self.in_thread(self.archive.entries, id):
                 if other < entry:
