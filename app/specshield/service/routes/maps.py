@@ -67,7 +67,9 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     Unknown cells count as occupied, and so does everything outside the map. Formulas can name the rooms.
     """
     body = received(request)
-    return await server.heavy.run(request, "add_map", body.content_type, body.content, caller)
+    kept = await server.heavy.run(request, "add_map", body.content_type, body.content, caller)
+    await server.store.follow()
+    return kept
 
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
@@ -111,4 +113,5 @@ async def image(map_id: MapId, request: Request, server: ServerState, owner: Own
 async def delete(map_id: MapId, server: ServerState, owner: Owner) -> Response:
     """Removes the map for the key that asks. Another key that sent the same map keeps it."""
     await asyncio.to_thread(server.maps.delete, map_id, owner)
+    await server.store.follow()
     return Response(status_code=204)

@@ -71,9 +71,12 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     body = received(request)
     if is_multipart(body.content_type):
         kept = await server.heavy.run(request, "add_policy", body.content_type, body.content, caller)
-        return await asyncio.to_thread(_show, server, kept, caller.name)
-    asked, name = await server.heavy.run(request, "check_policy", body.content, caller.name)
-    return await asyncio.to_thread(_ask, server, caller, asked, name)
+        shown = await asyncio.to_thread(_show, server, kept, caller.name)
+    else:
+        asked, name = await server.heavy.run(request, "check_policy", body.content, caller.name)
+        shown = await asyncio.to_thread(_ask, server, caller, asked, name)
+    await server.store.follow()
+    return shown
 
 
 def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict[str, Any]:
@@ -168,6 +171,7 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
     making = (await asyncio.to_thread(_training, server, record)).status in ("queued", "training")
     if making and await asyncio.to_thread(claims.owners, "policies", record.id) < 2:
         await asyncio.to_thread(server.jobs.cancel, record.id)
+        await server.store.follow()
         return Response(status_code=204)
     await asyncio.to_thread(claims.mark, "policies", record.id, owner, token)
     try:
@@ -180,4 +184,5 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
             await asyncio.to_thread(server.jobs.forget, record.id)
     finally:
         await asyncio.to_thread(claims.unmark, "policies", record.id, token)
+    await server.store.follow()
     return Response(status_code=204)

@@ -99,8 +99,13 @@ class Store:
         """Checks that the store takes a write: a store whose disk is full still answers reads."""
         async with self._reaching():
             await self.redis.set("specshield:ready", 1, ex=60)
+        await self.follow()
+
+    async def follow(self) -> None:
+        """Returns once as many replicas as were asked for have all that was written before."""
         if self._replicas:
-            await self.load("ready")
+            async with self._reaching():
+                await self._wire.follow()
 
     async def create(self, id: str, config: bytes, change: Change, *limits: Limit) -> bytes:
         """Creates a session and returns its first version. Raises SessionExists and LimitReached. `config`

@@ -31,6 +31,9 @@ class Script:
         self.text, self.sha = text, hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()
 
 
+NOTHING = Script("return 1")  # its answer, too, waits for the replicas
+
+
 class Wire:
     """make: makes a connection of redis-py, not yet open. timeout: longest wait for one answer, all tries
     included [s]. replicas: how many replicas need to have all that an answer tells before it is given.
@@ -60,6 +63,10 @@ class Wire:
                 if not tries_left:
                     raise
                 tries_left -= 1
+
+    async def follow(self) -> None:
+        """Returns once the replicas have all that was written before. Raises what `run` raises."""
+        await self.run(NOTHING, (), ())
 
     async def _open(self) -> _Link:
         async with self._opening:

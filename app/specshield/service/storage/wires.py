@@ -34,6 +34,10 @@ class Wires:
             self._look_again()
             raise
 
+    async def follow(self) -> None:
+        """As `Wire.follow`, for all masters: what was written may lie on any of them."""
+        await asyncio.gather(*(self._to(node).follow() for node in self._cluster.get_primaries()))
+
     def _look_again(self) -> None:
         """Starts a task that asks which node has which keys: a silent node would use up a caller's time."""
         if self._looking is None or self._looking.done():
