@@ -202,7 +202,10 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
     """With SPECSHIELD_STORE_REPLICAS=1. What is written is told later, to whoever asks again."""
 
     async def scene(url: str, replica: int) -> None:
-        store = Store(url, timeout=1.0, ttl=60, replicas=1)
+        store, soon = (
+            Store(url, timeout=60.0, ttl=60, replicas=1),
+            Store(url, timeout=1.0, ttl=60, replicas=1),
+        )
         id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
         await store.create(id, b"config", Change(b"state", bytes(24)))
         seen = await store.load(id, 0)
@@ -210,11 +213,11 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
         step = Change(b"state", bytes(24), 24, 0, b"what the step left")
         os.kill(replica, signal.SIGSTOP)
         try:
-            await refused(lambda: store.append(id, seen.version, step))
-            await refused(lambda: store.load(id, 0))
-            await refused(store.follow)
+            await refused(lambda: soon.append(id, seen.version, step))
+            await refused(lambda: soon.load(id, 0))
+            await refused(soon.follow)
             if kind is watched:
-                await refused(store.ping)
+                await refused(soon.ping)
         finally:
             os.kill(replica, signal.SIGCONT)
         while True:
@@ -227,7 +230,8 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
         assert found.step == b"what the step left"
         if kind is watched:  # the other masters of the cluster have no replica
             await store.follow()
-        await store.aclose()
+        for each in (store, soon):
+            await each.aclose()
 
     with kind(tmp_path) as there:
         replica = there.replica if kind is watched else there.nodes[3]
