@@ -28,7 +28,8 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import left_out, open_objects
 from specshield.service.storage.store import Change, Dump
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import HUNG, serving, wait_for
+from tests.serving import HUNG, free_port, serving, wait_for
+from tests.stores import answers, needs_redis, running
 
 TTL = 3600
 ROW = bytes(range(24))
@@ -40,6 +41,18 @@ def url(tmp_path_factory):
     embedded.join()
     yield embedded.url
     embedded.leave()
+
+
+@pytest.fixture(params=["own", pytest.param("redis", marks=needs_redis)])
+def bounded(request, tmp_path):
+    """The URL of a store whose memory may be bounded: Redis refuses more than the server's own then."""
+    if request.param == "own":
+        yield request.getfixturevalue("url")
+        return
+    port = free_port()
+    with running(tmp_path / "redis", "--port", str(port), "--save", ""), redis.Redis(port=port) as client:
+        wait_for(lambda: answers(client))
+        yield f"redis://127.0.0.1:{port}"
 
 
 @pytest.fixture(params=["folder", "fsspec"])
@@ -295,7 +308,7 @@ def test_a_session_that_another_server_has_back_at_once_stays_on_the_list(url, a
     run(url, archive, story)
 
 
-def test_a_store_whose_memory_is_full_is_freed_by_moves_and_deletions(url, archive):
+def test_a_store_whose_memory_is_full_is_freed_by_moves_and_deletions(bounded, archive):
     async def story(store: ArchivingStore) -> None:
         await begin(store, "mover@moves", 3)
         await begin(store, "mover@goes", 3)
@@ -318,7 +331,7 @@ def test_a_store_whose_memory_is_full_is_freed_by_moves_and_deletions(url, archi
         finally:
             await store.redis.config_set("maxmemory", 0)
 
-    run(url, archive, story)
+    run(bounded, archive, story)
 
 
 def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):

@@ -27,6 +27,10 @@ INDEX = "specshield:sessions"
 Limit = tuple[str | None, int]  # the most sessions that an owner may have, or for None all owners together
 NO_VERSION = b"-"  # a version that no session has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
+# A script, since a store whose memory is full refuses all commands of a transaction, also those that read.
+DUMP = """\
+return {redis.call('HMGET', KEYS[1], 'config', 'state', 'version'), redis.call('GET', KEYS[2]),
+    redis.call('LRANGE', KEYS[3], 0, -1)}"""
 
 
 class Record(NamedTuple):
@@ -79,6 +83,7 @@ class Store:
     def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
         self.redis: Any = connect(url, socket_timeout=timeout)
         self._claim = self.redis.register_script(Path(__file__).with_name("claim.lua").read_text())
+        self._dump = self.redis.register_script(DUMP)
         self._in_cluster = is_cluster(url)
         self._wire: Wire | Wires = Wires(self.redis, timeout, replicas)
         if not self._in_cluster:
@@ -167,12 +172,8 @@ class Store:
 
     async def dump(self, id: str) -> Dump | None:
         """All of a session, as it is at one moment; None if there is no session."""
-        session, rows, steps = keys(id)
-        async with self._reaching(), self.redis.pipeline(transaction=True) as pipe:
-            pipe.hmget(session, "config", "state", "version")
-            pipe.get(rows)
-            pipe.lrange(steps, 0, -1)
-            (config, state, version), found, left = await pipe.execute()
+        async with self._reaching():
+            (config, state, version), found, left = await self._dump(keys=keys(id))
         return None if config is None or found is None else Dump(config, state, version, found, left)
 
     async def count(self, owner: str | None) -> int:
