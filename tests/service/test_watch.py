@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -164,6 +166,22 @@ def test_lines_of_the_processes_for_heavy_work_are_of_the_same_form(tmp_path):
         lines = [json.loads(line) for line in server.log.read_text().splitlines()]
     left_out = [line["message"] for line in lines if "case2 is left out" in line["message"]]
     assert len(left_out) == 2  # by the server, and by the process that read the request
+
+
+def test_lines_of_other_packages_are_of_the_same_form():
+    program = """
+import logging.config
+from rq.logutils import setup_loghandlers
+from specshield.service.watch import logs
+
+logging.config.dictConfig(logs.config("json", "info"))
+setup_loghandlers("WARNING")  # as rq's worker does
+logging.getLogger("rq.worker").warning("from rq")
+logging.getLogger("asyncio").error("from asyncio")
+"""
+    ran = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert ran.stdout == ""  # all lines go to standard error
+    assert [json.loads(line)["message"] for line in ran.stderr.splitlines()] == ["from rq", "from asyncio"]
 
 
 def metrics_named(expression: str) -> set[str]:

@@ -49,7 +49,9 @@ def config(form: str, level: str) -> dict[str, Any]:
     # Metrics and the lines for refused requests take the place of uvicorn's access log, which takes some 60
     # us.
     del loggers["uvicorn.access"]
-    return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
+    others = {"handlers": ["default"], "level": "WARNING"}  # such as rq and asyncio
+    own_parts = {"formatters": formatters, "handlers": handlers, "loggers": loggers, "root": others}
+    return {**LOGGING_CONFIG, **own_parts}
 
 
 def _is_news(record: logging.LogRecord) -> bool:
