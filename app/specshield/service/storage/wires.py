@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import anyio
@@ -21,7 +22,7 @@ class Wires:
     def __init__(self, cluster: Any, timeout: float, replicas: int) -> None:
         self._cluster, self._timeout, self._replicas = cluster, timeout, replicas
         self._wires: dict[str, Wire] = {}  # by the names of the nodes
-        self._looking: asyncio.Future[Any] | None = None
+        self._looking: asyncio.Task[None] | None = None
 
     async def run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         """As `Wire.run`, on the node that has the keys. If that node has lost the keys, redis-py runs the
@@ -41,7 +42,11 @@ class Wires:
     def _look_again(self) -> None:
         """Starts a task that asks which node has which keys: a silent node would use up a caller's time."""
         if self._looking is None or self._looking.done():
-            self._looking = asyncio.gather(self._cluster.nodes_manager.initialize(), return_exceptions=True)
+            self._looking = asyncio.create_task(self._look())
+
+    async def _look(self) -> None:
+        with suppress(Exception):  # the next caller sees for itself
+            await self._cluster.nodes_manager.initialize()
 
     async def _run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         if not self._cluster.get_nodes():
