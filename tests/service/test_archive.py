@@ -338,10 +338,13 @@ def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
     async def story(store):
         await begin(store, "@old", 1)
         dump = await store.dump("@old")
-        assert await store.put_away("@old", time.time() - 2, dump)
+        assert await store.put_away("@old", time.time() - 0.001, dump)
         assert await store.load("@old") is None
         assert await store.everything("", None, 10) == ([], None)
         await begin(store, "@old", 0)  # its id is free again
+        whole = Entry.of("@old", "00000001,0,06a000000")  # as older versions name a file
+        assert whole is not None
+        assert whole.expires == 0x6A000000
 
     run(url, archive, story)
 

@@ -4,8 +4,9 @@
 
 A session's key is `owner@id`, as in the store. `changes` is the number of writes to the session, and
 `beginning` differs for two sessions of one id. So a file never changes, and a late writer never replaces a
-newer file. A file has a head (config, state) and a body (rows, steps), each packed with msgpack and
-compressed with zstandard. All calls block.
+newer file. `expires` is nine hexadecimal digits of seconds since 1970 and three of their fraction; older
+versions rounded it up. A file has a head (config, state) and a body (rows, steps), each packed with msgpack
+and compressed with zstandard. All calls block.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ DAMAGED = (ValueError, zstandard.ZstdError)  # raised for a file that is damaged
 
 @dataclass(frozen=True, order=True)
 class Entry:
-    """One file. expires: when it is erased [s since 1970]."""
+    """One file. until: `expires` as its name tells it."""
 
     key: str
     changes: int
     beginning: str
-    expires: int
+    until: str
 
     @staticmethod
     def of(key: str, name: str) -> Entry | None:
@@ -48,12 +49,17 @@ class Entry:
         match = NAME.fullmatch(name)
         if match is None:
             return None
-        changes, beginning, expires = match.groups()
-        return Entry(key, int(changes, 16), beginning, int(expires, 16))
+        changes, beginning, until = match.groups()
+        return Entry(key, int(changes, 16), beginning, until)
+
+    @property
+    def expires(self) -> float:
+        """When it is erased [s since 1970]."""
+        return int(self.until, 16) / 16 ** (len(self.until) - 9)
 
     @property
     def path(self) -> str:
-        return f"{_folder(self.key)}/{self.changes:08x},{self.beginning},{self.expires:09x}"
+        return f"{_folder(self.key)}/{self.changes:08x},{self.beginning},{self.until}"
 
 
 class Archive:
@@ -65,7 +71,7 @@ class Archive:
         number of bytes that were written: 0 if the file existed already.
         """
         beginning, _, changes = dump.version.decode().partition(":")
-        entry, content = Entry(key, int(changes), beginning, int(expires) + 1), pack(dump)
+        entry, content = Entry(key, int(changes), beginning, f"{int(expires * 16**3):012x}"), pack(dump)
         if self._objects.read(entry.path) == content:
             return entry, 0
         self._objects.write(entry.path, content)
