@@ -25,9 +25,9 @@ from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
-from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, READY, Startup
+from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, NEARLY, READY, Startup
 from specshield.shield.decision import Config
-from tests.serving import serving, wait_for
+from tests.serving import children, command_line, runs, serving, wait_for
 
 
 @pytest.fixture
@@ -113,6 +113,38 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         server.kill()
         wait_for(lambda: not compiling(kernels))
     assert re.search(r"INFO: +compiling the kernels that .* take about \d+ s", server.log.read_text())
+
+
+def test_of_several_processes_none_that_is_not_ready_answers_once_the_server_is(tmp_path, incomplete):
+    mark = incomplete / compiled.mark(READY).name
+
+    def kill(pid):
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: not runs(pid))
+
+    def said(path):
+        """By any of the processes: each request has a connection of its own."""
+        return {httpx.get(f"{server.url}{path}", timeout=None, verify=False).status_code for _ in range(30)}
+
+    def compiles():
+        return server.log.read_text().count("compiling the kernels that are not on the disk")
+
+    environment = {"NUMBA_CACHE_DIR": str(incomplete), "SPECSHIELD_COMPLETE": "false"}
+    with serving(tmp_path / "data", "--workers", "2", **environment) as server:
+        first, second = (pid for pid in children(server.process.pid) if "spawn_main" in command_line(pid))
+        begun = compiles()
+        with open(f"{mark}.lock", "ab") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            mark.unlink()
+            kill(first)
+            wait_for(lambda: compiles() == begun + 1)  # the process in its place
+            time.sleep(NEARLY + CHECK_EVERY)
+            assert said("/readyz") | said("/v1/sessions") == {200}
+            kill(second)
+            wait_for(lambda: alive(server.url) and said("/readyz") == said("/v1/sessions") == {503})
+            mark.touch()
+        wait_for(lambda: 200 in said("/readyz"))
+        assert said("/readyz") | said("/v1/sessions") == {200}
 
 
 def test_what_an_earlier_start_compiled_counts(tmp_path, monkeypatch):

@@ -32,7 +32,7 @@ from specshield.service.routes.stream import StreamRoute
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
-from specshield.service.startup import Startup, complete, prepare
+from specshield.service.startup import Startup, complete, prepare, until_it_may_listen
 from specshield.service.state import Server
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import ArchivingStore
@@ -47,7 +47,6 @@ from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 log = logging.getLogger("specshield")
-NEARLY = 1.0  # [s] to wait for readiness before listening; chosen by hand
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
 set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
@@ -150,7 +149,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     )
     tasks = [asyncio.create_task(each) for each in running]
     try:
-        await asyncio.wait(tasks[:1], timeout=NEARLY)  # a request now would be told to wait a second
+        await until_it_may_listen(startup, tasks[0])
         yield
     finally:
         for task in tasks:

@@ -14,11 +14,13 @@ import contextlib
 import fcntl
 import gc
 import logging
+import os
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from specshield import compiled
 from specshield.cores import cores
@@ -33,11 +35,44 @@ KERNELS = 228  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR
 TAKES = 70  # [s] of a first start on two quiet cores; 29 to 73 were measured (`make wheels` prints it)
 TELL_EVERY = 5.0  # [s] between two lines of the log
 LOW = 10  # niceness of compiling in the background: with 19 it makes no progress beside 8 busy programs
-CHECK_EVERY = 0.25  # [s] between two looks whether another process has compiled them
+NEARLY = 1.0  # [s] to wait for readiness before listening; chosen by hand
+CHECK_EVERY = 0.25  # [s] between two looks whether another process has compiled them, or is ready
 # [objects] that are new before a collection looks for cycles among them. With Python's 700 that took 18 us of
 # a step and found none; with this number it takes 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
 YOUNG = 7_000
+_SHARED = "PROMETHEUS_MULTIPROC_DIR"  # names the folder that a server's processes share
 log = logging.getLogger("specshield")
+
+
+class Processes:
+    """What the processes of a server with --workers tell each other of their start, and for as long as they
+    live: each holds a lock on a file `<pid>.<state>`, in a folder that they share.
+    """
+
+    _told: int | None = None  # the descriptor of the locked file
+
+    def tell(self, state: str) -> None:
+        """Replaces what this process has told before."""
+        if _SHARED in os.environ:
+            path, before = Path(os.environ[_SHARED], f"{os.getpid()}.{state}"), self._told
+            self._told = os.open(path, os.O_RDWR | os.O_CREAT)
+            fcntl.flock(self._told, fcntl.LOCK_EX)
+            if before is not None:
+                fcntl.flock(before, fcntl.LOCK_UN)  # a forked process may have it too
+                os.close(before)
+
+    def any(self, state: str) -> bool:
+        """Whether any of them is in this state."""
+        return _SHARED in os.environ and any(map(_is_locked, Path(os.environ[_SHARED]).glob(f"*.{state}")))
+
+
+def _is_locked(path: Path) -> bool:
+    with open(path, "rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 @dataclass
@@ -55,6 +90,7 @@ class Startup:
     compiling: bool = False
     parts: list[str] = field(default_factory=list)
     completing: bool = False
+    processes: Processes = field(default_factory=Processes)
 
     def has(self, part: str) -> bool:
         """Whether the kernels of a part of warmup.LATER are compiled, or no process is going to compile them.
@@ -86,6 +122,23 @@ class Startup:
 def on_disk() -> int:
     """How many of the kernels that a start needs are on the disk, by this start or an earlier one."""
     return min(compiled.on_disk(), KERNELS)
+
+
+async def until_it_may_listen(startup: Startup, prepared: asyncio.Task[Any]) -> None:
+    """Returns when the server is ready or, if that takes longer, when it may take requests all the same: it
+    then answers that it is starting. It may not while another process is ready, which answers them all.
+    """
+
+    def done(_: object) -> None:
+        if startup.ready:
+            startup.processes.tell("ready")
+
+    prepared.add_done_callback(done)
+    await asyncio.wait([prepared], timeout=NEARLY)
+    while not prepared.done() and startup.processes.any("ready"):
+        await asyncio.wait([prepared], timeout=CHECK_EVERY)
+    if not startup.ready:
+        startup.processes.tell("starting")
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
+from specshield.errors import Starting
 from specshield.service import metrics
 from specshield.service.schemas.base import Health
 from specshield.service.state import ServerState, problems
@@ -29,12 +30,16 @@ async def readyz(server: ServerState) -> Health:
 
     The first start of an installation compiles the kernels, in about a minute; `kernels` says how many are
     compiled. Until then every path under /v1 answers 503 `starting`, with Retry-After. A server that was told
-    to stop answers 503 here at once, and answers everything else until it stops.
+    to stop answers 503 here at once, and answers everything else until it stops. With several processes it is
+    ready once all that take requests are.
     """
     await server.store.ping()
     problem = server.startup.problem()
     if problem is not None:
         raise problem
+    if server.startup.processes.any("starting"):
+        expected = "/readyz again, until it answers 200"
+        raise Starting("another process of the server is not ready", expected=expected)
     return Health(status="ok")
 
 

@@ -55,7 +55,7 @@ class Entry:
     @property
     def expires(self) -> float:
         """When it is erased [s since 1970]."""
-        return int(self.until, 16) / 16 ** (len(self.until) - 9)
+        return int(self.until, 16) / 16.0 ** (len(self.until) - 9)
 
     @property
     def path(self) -> str:
