@@ -6,7 +6,9 @@ import contextlib
 import json
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from http.client import HTTPResponse
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -87,6 +89,28 @@ def test_what_cannot_open_a_websocket_is_refused(small: RunningServer, line: str
         connection.sendall(f"{line}\r\nHost: 127.0.0.1\r\n{opening}{key}".encode())
         status, problem = _answer(connection)
     assert (status, problem["type"]) == (422, "invalid-input")
+
+
+def test_a_request_that_also_asks_for_another_protocol_is_answered_as_any(server: RunningServer) -> None:
+    """As the HTTP client of Java and `curl --http2` do; its body may come with the head or later."""
+    body = b'{"formula": "F[0,3] x > 0"}'
+    head = f"""POST /v1/specs/validate HTTP/1.1
+Host: {urlsplit(server.url).netloc}
+Connection: Upgrade, HTTP2-Settings
+Upgrade: h2c
+HTTP2-Settings: AAMAAABk
+Content-Type: application/json
+Content-Length: {len(body)}
+
+""".replace("\n", "\r\n").encode()
+    with _connect(server) as connection:
+        for parts in ((head + body,), (head[:-3], head[-3:], body)):
+            for part in parts:
+                connection.sendall(part)
+                time.sleep(0.01)  # so that it comes by itself, most likely
+            answer = HTTPResponse(connection)
+            answer.begin()
+            assert (answer.status, json.loads(answer.read())["horizon"]) == (200, 3)
 
 
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:

@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 import resource
 import socket
+import sys
 from functools import cache
 from typing import Any, cast
 
+import httptools
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -56,7 +58,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self._head, self._most = 0, _settings().max_header_bytes
-        self._in_head = self._upgraded = False
+        self._in_head = self._upgraded = self._again = False
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
         self.transport = cast(asyncio.Transport, Corked(transport, self.loop))
@@ -83,6 +85,7 @@ class BoundedProtocol(HttpToolsProtocol):
             if self._head > self._most:
                 self._refuse_head()
                 return
+        self._data = data
         super().data_received(data)
         idle = self.cycle is None or self.cycle.response_complete
         if self._late is None and (self._in_head or idle) and not self._upgraded:
@@ -100,12 +103,31 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         self._in_head = False
+        self._again = self.parser.should_upgrade() and self._get_upgrade() not in (None, b"websocket")
+        if self._again:
+            return
         self._stop_waiting()
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
+        if self._again:
+            return
         super().on_message_complete()
         self.scope["state"][ARRIVED] = True
+
+    def _unsupported_upgrade_warning(self) -> None:
+        """Reads the request again without its header Upgrade, which a server may ignore: httptools leaves out
+        the body of a request that has it. Java's HTTP client and `curl --http2` ask for HTTP/2 in this way.
+        """
+        if not self._again:
+            return
+        version, method = self.parser.get_http_version().encode(), self.parser.get_method()
+        lines = [name + b": " + value for name, value in self.headers if name != b"upgrade"]
+        read = sys.exc_info()[1]
+        rest = self._data[read.args[0] :] if read is not None else b""
+        self.parser = httptools.HttpRequestParser(self)
+        head = b"\r\n".join([method + b" " + self.url + b" HTTP/" + version, *lines, b"", b""])
+        super().data_received(head + rest)
 
     def handle_websocket_upgrade(self) -> None:
         self._upgraded = True
