@@ -128,6 +128,10 @@ def test_types_that_a_route_does_not_take(client, kept):
     for declared in ("multipart/form-data; boundary=x", "application/msgpack"):
         answer = client.post("/v1/specs/validate", content=b"x", headers={"Content-Type": declared})
         problem(answer, 415, "unsupported-media-type", "Content-Type")
+    asked = {"url": "/v1/specs/validate", "json": {"formula": "x > 0"}}
+    assert client.post(**asked, headers={"Content-Encoding": "identity"}).status_code == 200
+    answer = client.post(**asked, headers={"Content-Encoding": "gzip"})
+    problem(answer, 415, "unsupported-media-type", "Content-Encoding")
 
 
 def serve(*options, **environment):

@@ -49,7 +49,7 @@ def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[st
         raise CrossSite(told, path="Origin", got=origin, expected=expected)
     with_body = headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
     if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and with_body:
-        _check_type(scope["path"], headers.get(b"content-type", b"").decode("latin-1"))
+        _check_type(scope["path"], headers)
 
 
 @lru_cache(4096)
@@ -97,7 +97,9 @@ def _from_elsewhere(method: str, headers: Headers, host: str, allowed: frozenset
     return fetched != ("GET", b"navigate", b"document")  # a link that somebody follows, not a frame
 
 
-def _check_type(path: str, declared: str) -> None:
+def _check_type(path: str, headers: Headers) -> None:
+    names = b"content-type", b"content-encoding"
+    declared, coding = (headers.get(name, b"").decode("latin-1") for name in names)
     kind = declared.partition(";")[0].strip().lower()
     taken = ["application/json"]
     if path.rstrip("/") in UPLOADS:
@@ -108,3 +110,6 @@ def _check_type(path: str, declared: str) -> None:
         told = "the body's Content-Type is not accepted here"
         expected = f"the header Content-Type: {' or '.join(taken)}"
         raise UnsupportedMediaType(told, path="Content-Type", got=declared, expected=expected)
+    if coding.lower() not in ("", "identity"):
+        told, expected = "a compressed body is not accepted", "the body as it is, without this header"
+        raise UnsupportedMediaType(told, path="Content-Encoding", got=coding, expected=expected)
