@@ -25,6 +25,7 @@ from specshield.errors import InputError
 from specshield.local import LocalShield
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
+from tests.service.test_bad_input import problem
 from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
 from tests.serving import HUNG, command_line, serving, wait_for
 
@@ -129,6 +130,10 @@ def test_a_handshake_is_refused_over_http(server):
         assert refused.value.response.status_code == status
         assert json.loads(refused.value.response.body)["type"] == "not-found"
     assert "handshake" not in server.log.read_text()  # a caller's mistake is no error of the server's
+
+
+def test_a_proxy_that_passes_on_no_upgrade_is_told_of(client, begin):
+    problem(client.get(f"/v1/sessions/{begin()['id']}/stream"), 422, "invalid-input", "Upgrade")
 
 
 def test_text_that_is_no_text_ends_the_stream_and_writes_no_traceback(server, begin):

@@ -17,7 +17,7 @@ from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from specshield.errors import ServerError, SpecshieldError
+from specshield.errors import InputError, ServerError, SpecshieldError
 from specshield.service import metrics, problems
 from specshield.service.access.owners import scoped
 from specshield.service.routes.messages import read_step, write_problem
@@ -39,9 +39,16 @@ class StreamRoute:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        found = PATH.fullmatch(scope["path"]) if scope["type"] == "websocket" else None
+        found = PATH.fullmatch(scope["path"]) if scope["type"] in ("http", "websocket") else None
         if found is None:
             await self.app(scope, receive, send)
+            return
+        if scope["type"] == "http":
+            expected = (
+                "Upgrade: websocket, which a proxy in front of the server has to pass on, and Connection"
+            )
+            error = InputError("this opens no WebSocket", path="Upgrade", expected=expected)
+            await problems.ProblemResponse(error)(scope, receive, send)
             return
         scope.setdefault("state", {})["request_id"] = secrets.token_hex(8)
         scope["path_params"] = {"session_id": found[1]}
