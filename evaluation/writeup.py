@@ -6,6 +6,7 @@ asked for summarises; the others lie in a folder beside it, in which other comma
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -116,4 +117,10 @@ def _methods(found: Iterable[Results]) -> list[str]:
 
 
 def _write(page: Path, parts: Iterable[str]) -> None:
-    page.write_text("\n\n".join(part for part in parts if part) + "\n")
+    """Writes the page. A link to a page that is not there is its words alone."""
+    text = "\n\n".join(part for part in parts if part) + "\n"
+
+    def told(link: re.Match[str]) -> str:
+        return link[0] if (page.parent / link[2]).is_file() else link[1]
+
+    page.write_text(re.sub(r"\[([^]]+)\]\(([^)]+\.md)\)", told, text))

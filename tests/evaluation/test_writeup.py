@@ -39,6 +39,7 @@ def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
     (folder / "runs.jsonl").write_text("".join(lines))
     writeup.write_up(tmp_path, tmp_path / "page.md")
     page = (tmp_path / "page" / "cases.md").read_text()
+    assert "there is a cost (harder tasks)" in page  # no link to a page that is not there
     assert "- ours: main task -50.0 points below unmodified.\n" in page
     assert "main task +50.0 points below unmodified over the 2 runs that both have.\n" in page
     assert "unmodified does its task in 5 of 6 runs." in page
