@@ -112,8 +112,8 @@ def _told(rows: Sequence[Row]) -> Iterator[str]:
         above = sum(row["satisfied"]["low"] > row["threshold"] for row in asked)
         costs = [row["kl"] / whole[row["case"], row["model"]] for row in asked if whole]
         yield (
-            f"- **{kind}**: of {len(asked)} rows with a threshold below 1, the interval of the share kept "
-            f"lies below\n  the threshold in {below} and above it in {above}."
+            f"- **{kind}**: of {len(asked)} row{'s'[: len(asked) != 1]} with a threshold below 1, the "
+            f"interval of the share kept lies below\n  the threshold in {below} and above it in {above}."
             + (f" Their KL is {min(costs):.2f} to {max(costs):.2f} of that at 1." if costs else "")
         )
     values = [row for row in rows if row["kind"] == "robustness" and row["threshold"] >= 0.0]
@@ -129,7 +129,8 @@ def _kept(rows: Sequence[Row]) -> Iterator[str]:
     for metres in sorted({row["threshold"] for row in rows}):
         kept = [row["satisfied"] for row in rows if row["threshold"] == metres]
         counts = sorted(each["count"] for each in kept)
-        yield f"at {metres:g} m the rule is kept in {counts[0]} to {counts[-1]} of {kept[0]['of']} runs a row"
+        told = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
+        yield f"at {metres:g} m the rule is kept in {told} of {kept[0]['of']} runs a row"
 
 
 def draw(rows: Sequence[Row], file: Path) -> None:

@@ -80,9 +80,10 @@ def figures(found: Sequence[Outcome]) -> dict[str, Any]:
 def row(trial: Trial, found: Sequence[Outcome]) -> str:
     got = figures(found)
     slack = "learned" if trial.uncertain else str(trial.slack)
+    changed = "-" if got["p50"] is None else f"{got['p50']} / {got['p99']}"
     return (
         f"| {trial.robot} | {trial.case} | {trial.world} | {trial.sensing} | "
         f"{got['kept']} of {got['could']} | {100 * got['low']:.1f} to {100 * got['high']:.1f} % | "
         f"{got['could']} of {got['runs']} | "
-        f"{got['p50']} / {got['p99']} | {got['kl']:.0f} | {slack} |"
+        f"{changed} | {got['kl']:.0f} | {slack} |"
     )
