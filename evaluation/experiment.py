@@ -48,6 +48,10 @@ SESSIONS = {  # NAME@default: what a session is where nobody says anything
     "step": Config(),
     "robustness": Config(evaluation="robustness"),  # J = rho
 }
+FORMS = (
+    "NAME@METRES, NAME@METRES/STEPS, NAME@conformal/STEPS, NAME@default, NAME@default/SHARE, "
+    f"NAME@episode/SHARE, NAME@step/SHARE or NAME@robustness/METRES, with NAME one of {', '.join(CAREFUL)}"
+)
 THRESHOLDS: dict[str, ThresholdOver] = {  # NAME@default/D and so on: over what the threshold D holds
     "default": "episode", "episode": "episode", "step": "step", "robustness": "step"
 }  # fmt: skip
@@ -136,7 +140,7 @@ class Setting:
         """The paper's shield. Raises NotFound where there is no DQN for the case."""
         if self.learned is None:
             raise NotFound(
-                f"there is no learned policy for {self.case.name}", path="methods", got="paper",
+                f"there is no learned policy for {self.case.name}", path="--methods", got="paper",
                 expected="a case with a folder in models/, or other methods",
             )  # fmt: skip
         return make_shield([replace(self.learned, literal=True)])
@@ -217,8 +221,8 @@ def split(method: str) -> tuple[str, Config]:
     """The kind of a method, and its session's settings. Raises NotFound or InputError."""
     kind, at, asked = method.partition("@")
     if kind not in METHODS:
-        names = ", ".join(METHODS)
-        raise NotFound(f"there is no method {kind!r}", path="methods", got=method, expected=f"one of {names}")
+        told = f"there is no method {kind!r}"
+        raise NotFound(told, path="--methods", got=method, expected=f"{', '.join(METHODS)}; or {FORMS}")
     if not at:
         return kind, Config()
     metres, _, steps = asked.partition("/")
@@ -233,10 +237,8 @@ def split(method: str) -> tuple[str, Config]:
         margin, slack = math.nan, 0
     if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
-            "not a method with a margin", path="methods", got=method,
-            expected=f"NAME@METRES, NAME@METRES/STEPS, NAME@default or NAME@step/THRESHOLD, the name one of "
-            f"{', '.join(CAREFUL)}",
-        )  # fmt: skip
+            "after the @ there is no setting of this method", path="--methods", got=method, expected=FORMS
+        )
     return kind, Config(margin=margin, slack=slack)
 
 
