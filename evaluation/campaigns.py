@@ -43,7 +43,9 @@ def evaluate(
         progress = _Progress(f"{experiment.setting.case.name}, {experiment.noise}", runs)
         records = evaluation.evaluate(experiment, runs, chosen, folder, processes, redis_url, progress.show)
         progress.clear()
-        figures = results.results(experiment, records) if folder is None else results.write(folder)
+        figures = results.results(experiment, records)
+        if folder is not None:
+            results.write(folder)  # of all that the folder holds
         if as_json:
             print(json.dumps({**figures, "records": [record.to_json() for record in records]}))
         else:
@@ -51,7 +53,8 @@ def evaluate(
                 f"{progress.title}, model {experiment.model}, seed {experiment.seed}: {figures['formula']}\n"
             )
             print(f"{results.table(figures)}\n")
-            print(f"{duration(time.monotonic() - began)}{'' if folder is None else f'; {folder}'}")
+            kept = "" if folder is None else f"; {folder / 'table.md'} has all runs that are kept there"
+            print(f"{duration(time.monotonic() - began)}{kept}")
         broken |= experiment.noise == "none" and any(
             not record.satisfied and certifies(record.method) for record in records
         )

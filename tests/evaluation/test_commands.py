@@ -1,6 +1,7 @@
 """The commands that evaluation adds to `specshield`, as a user runs them."""
 
 import json
+import re
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -63,6 +64,9 @@ def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path)
     assert (folder / "runs.jsonl").read_text() == kept
     assert [one["satisfied"]["count"] for one in figures["methods"]] == [0, 2]
     assert [record["run"] for record in figures["records"]] == [0, 0, 1, 1]
+    (row,) = re.findall(r"^\| ours \|.*", specshield(*arguments, "--runs", "1").stdout, re.MULTILINE)
+    assert "1 of 1 (2.5 to 100.0 %)" in row  # of the runs that were asked for
+    assert "2 of 2 (15.8 to 100.0 %)" in (folder / "table.md").read_text()
 
 
 def test_report_writes_a_page_and_its_pictures(tmp_path):
@@ -132,10 +136,13 @@ def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
         ("worlds", "--sensing", "nope"),
         ("results", "--only", "nope"),
         ("curves", "--metres", "0.1,nope"),
+        ("evaluate", "--methods", "ours,nope"),
+        ("evaluate", "--methods", "ours@nope"),
     ],
 )
 def test_a_name_that_nothing_has_is_refused(command, option, given, tmp_path):
-    refused = specshield(command, option, given, "--out", str(tmp_path), code=1)
+    case = ("--case", "1") if command == "evaluate" else ()
+    refused = specshield(command, *case, option, given, "--out", str(tmp_path), code=1)
     (line,) = refused.stderr.splitlines()
     assert line.startswith(f"{option}: ")
     assert "nope" in line
