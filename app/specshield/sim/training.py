@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import InputError
+from specshield.errors import InputError, PolicyError
 from specshield.policy.methods import DEFAULT, METHODS, Run
 from specshield.policy.options import read_options
 from specshield.policy.tensors import replace_file
@@ -35,7 +35,12 @@ def train(
     """
     began, made_by, loaded = time.monotonic(), METHODS.get(method), load_case(case)
     given = _parse(options) | ({} if updates is None else {"updates": updates})
-    chosen = read_options(made_by.options, given)
+    try:
+        chosen = read_options(made_by.options, given)
+    except PolicyError as error:  # it names a field of a request
+        name = str(error.path).removeprefix("options.")
+        error.path = "--updates" if name == "updates" and updates is not None else f"--option {name}"
+        raise
     own = MODELS / (loaded.name if method == DEFAULT else f"{loaded.name}-{method}")
     if out is None and (own / "policy.safetensors").exists():
         expected = f"a folder to write to; --out {own} replaces that policy"
