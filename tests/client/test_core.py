@@ -281,3 +281,5 @@ def test_waiting_until_ready_ends_and_says_how_far_the_server_was():
     assert waits == pytest.approx([calls.READY_EVERY, 0.5 - 0.02 - calls.READY_EVERY])
     error, _, _ = drive(calls.wait_until_ready(0.5), problem(404, "not-found"))
     assert type(error) is errors.NotFound
+    error, sent, _ = drive(calls.wait_until_ready("x"))
+    assert (type(error), error.path, sent) == (errors.InputError, "timeout", [])

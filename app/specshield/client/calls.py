@@ -25,7 +25,7 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     This also waits for a server that cannot be reached yet. Raises TransportTimeout after `timeout` [s], with
     the progress of the server's start.
     """
-    seconds = 0.0
+    seconds, timeout = 0.0, wire.seconds_value(timeout, "timeout")
     while True:
         outcome = yield Request("GET", "/readyz")
         seconds += outcome.seconds
