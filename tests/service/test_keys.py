@@ -86,11 +86,15 @@ def test_a_command_acts_as_the_owner_of_the_key_that_it_starts_a_server_with(key
     assert on_keys(keyed, act) == "dora"
 
 
-def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
+def test_keys_made_listed_and_revoked_by_the_command_line(keyed, tmp_path):
     def keys(*arguments):
         return run_specshield("keys", *arguments, SPECSHIELD_DATA_DIR=str(keyed.data_dir))
 
     assert keys("list").stderr == "there are no keys\n"
+    none = tmp_path / "none"
+    for asked in (("list",), ("revoke", "carol")):
+        run_specshield("keys", *asked, SPECSHIELD_DATA_DIR=str(none))
+    assert not none.exists()
     for endless in ("inf", "nan"):
         refused = keys("create", "carol", "--requests", endless)
         assert (refused.returncode, "--requests" in refused.stderr) == (2, True)

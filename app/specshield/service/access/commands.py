@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack, aclosing
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
@@ -36,7 +37,7 @@ def create(
 @app.command("list")
 def show() -> None:
     """The names of the keys, with their limits."""
-    listed = on_keys(lambda keys: keys.listed())
+    listed = _on_keys_there(lambda keys: keys.listed())
     if not listed:
         typer.echo("there are no keys", err=True)
     for key in listed:
@@ -48,8 +49,16 @@ def show() -> None:
 @app.command()
 def revoke(name: Name) -> None:
     """Revoke a key: servers refuse it within 2 s. What was made with it is kept."""
-    on_keys(lambda keys: keys.revoke(name))
+    _on_keys_there(lambda keys: keys.revoke(name))
     print(f"the key {name} is revoked")
+
+
+def _on_keys_there(action: Callable[[Keys], Awaitable[R]]) -> R:
+    """As `on_keys`. Where there is no data folder, none is made."""
+    from specshield.service.settings import read_settings
+
+    with TemporaryDirectory(prefix="specshield-") as folder:
+        return on_keys(action, read_settings().or_empty(folder))
 
 
 def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None) -> R:
