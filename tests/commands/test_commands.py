@@ -147,6 +147,8 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp
     [
         (("policy", "--map", "none.yaml", "--rule", "F[0,9] x > 1"), "--map: none.yaml cannot be read"),
         (("run", "case1", "--target", "2.5"), "--target: not a place"),
+        (("train", "--case", "1", "--updates", 9), "--updates: unknown option"),
+        (("train", "--case", "1", "--option", "beam=x"), "--option beam: the value is not valid"),
         (("run", "case1", "--shaping", "nope"), "unknown shaping; got 'nope'; expected one of projection"),
     ],
 )
@@ -322,6 +324,7 @@ def test_the_doctor_finds_a_folder_that_a_server_cannot_use(tmp_path):
         told = run_specshield("doctor", **data)
         assert told.returncode == 1
         assert f"SPECSHIELD_DATA_DIR cannot be used: File exists; got '{folder}'" in told.stdout
+        assert "the store is" not in told.stdout
         folder.unlink()
         (tmp_path / "away").rename(folder)
     (tmp_path / "elsewhere").mkdir()

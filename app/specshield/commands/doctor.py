@@ -123,11 +123,16 @@ def _kernels() -> Iterator[Finding]:
 
 def _disk(settings: Settings) -> Iterator[Finding]:
     from specshield.service.library.files import check_writable
+    from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.storage.objects import open_objects
 
+    own = settings.redis_url is None
     there, files = settings.data_dir, Path(settings.files_at)  # a URL names no folder that exists
     of = "SPECSHIELD_DATA_DIR" if settings.data_url is None else "SPECSHIELD_DATA_URL"
     kept = [(of, files), (of, files / "maps"), (of, files / "policies")]
-    for name, folder in (("SPECSHIELD_DATA_DIR", there), *kept):
+    store = EmbeddedStore(there).folder if own else there
+    used = [("SPECSHIELD_DATA_DIR", folder) for folder in (there, store, store / "appendonlydir")]
+    for name, folder in (*used, *kept):
         if folder.exists():
             check_writable(folder, name)
     near = next(folder for folder in (there.absolute(), *there.absolute().parents) if folder.exists())
@@ -143,25 +148,18 @@ def _disk(settings: Settings) -> Iterator[Finding]:
         )
     else:
         yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
+    if settings.data_url is not None:
+        open_objects(settings.data_url)
+    if own:
+        yield Finding("ok", "the store is the server's own, in the data folder")
 
 
 def _store(settings: Settings) -> Iterator[Finding]:
-    from specshield.service.library.files import check_writable
     from specshield.service.storage.connect import FAILURES, connect, drops
-    from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_first
-    from specshield.service.storage.objects import open_objects
 
-    if settings.redis_url is None:
-        store_in = EmbeddedStore(settings.data_dir).folder
-        for folder in (store_in, store_in / "appendonlydir"):
-            if folder.exists():
-                check_writable(folder, "SPECSHIELD_DATA_DIR")
-        yield Finding("ok", "the store is the server's own, in the data folder")
-        if settings.data_url is not None:
-            open_objects(settings.files_at)
+    if settings.redis_url is None:  # see `_disk`
         return
-
     began = time.perf_counter()
     try:
         with contextlib.closing(
