@@ -111,7 +111,7 @@ def test_bad_robots_name_the_field(spec, path):
     ("spec", "told"),
     [
         ([], "the robot is not an object"),
-        ({}, "the robot lacks ['actions', 'footprint']"),
+        ({}, "the robot lacks ['actions', 'footprint']; got []; expected ['actions', 'footprint'], and"),
         ({**CUSTOM, "wheels": 4}, "the robot has unknown fields ['wheels']"),
         (changed(("footprint", "radius"), None), "footprint lacks ['radius']"),
         (changed(("actions", 1), "left"), "actions[1] is not an object"),

@@ -178,7 +178,7 @@ def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"
-        expected = f"{sorted(required | optional)}"
+        expected = f"{sorted(required)}, and {sorted(optional)} if need be"
         raise _wrong(f"{which} {said}", path or None, sorted(map(str, item)), expected)
 
 
