@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
         for key in "xy"
     )
     yaw = _yaw(checks.member(origin, "orientation", "info.origin"))
+    if isinstance(data, Sequence) and "..." in data[-1:]:
+        told, expected = "the cells were cut off", "all cells, as `ros2 topic echo --full-length` writes them"
+        raise MapError(told, path="data", got=checks.shown(data), expected=expected)
     checks.items(data, "data", width * height, width * height)
     if set(map(type, data)) != {int} or not UNKNOWN <= min(data) <= max(data) <= 100:
         i = next(i for i, v in enumerate(data) if type(v) is not int or not UNKNOWN <= v <= 100)
