@@ -44,7 +44,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "serve",
             {"SPECSHIELD_MAX_SESSIONS": "abc"},
             "SPECSHIELD_MAX_SESSIONS is not valid: 'abc'",
-            "integer",
+            "whole number",
         ),
         (
             "serve",
@@ -129,6 +129,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "SPECSHIELD_MAPS_DIR is not valid: '",
             "a folder that is there",
         ),
+        ("serve", {"SPECSHIELD_WORKER": "yep"}, "SPECSHIELD_WORKER is not valid: 'yep'", "true or false"),
         (
             "serve",
             {"SPECSHIELD_DATA_DIR": "{folder}/" + "x" * 90},

@@ -169,7 +169,7 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
         {
             "path": ".".join(filter(None, (below, _path(item, body)[:200]))),
             "got": plain(item.get("input")),
-            "expected": _expected(item),
+            "expected": valid(item),
         }
         for item in found[:20]
     ]
@@ -183,7 +183,8 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     return kind(message, path=first["path"], got=first["got"], expected=expected, errors=listed)
 
 
-def _expected(item: Mapping[str, Any]) -> str:
+def valid(item: Mapping[str, Any]) -> str:
+    """What is valid where pydantic found an error."""
     said, context = str(item["msg"]), item.get("ctx", {})
     if item["type"].startswith("union_tag") and "expected_tags" in context:
         return f"one of {context['expected_tags']}"
@@ -192,7 +193,7 @@ def _expected(item: Mapping[str, Any]) -> str:
         **dict.fromkeys(("dict_type", "model_type", "model_attributes_type"), "an object"),
         **dict.fromkeys(("int_parsing", "int_type", "int_from_float"), "a whole number"),
         **dict.fromkeys(("float_parsing", "float_type"), "a number"),
-        "bool_type": "true or false",
+        **dict.fromkeys(("bool_parsing", "bool_type"), "true or false"),
         "string_type": "a text",
         "list_type": "a list",
         "string_too_short": "a text of {min_length} or more characters",

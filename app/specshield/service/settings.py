@@ -256,6 +256,8 @@ def read_settings() -> Settings:
     try:
         return Settings()
     except ValidationError as invalid:
+        from specshield.service.problems import valid
+
         wrong = invalid.errors(include_url=False)[0]
         field = str(wrong["loc"][0]).lower().removeprefix("specshield_")
         name = "REDIS_URL" if field == "redis_url" else f"SPECSHIELD_{field.upper()}"
@@ -264,5 +266,5 @@ def read_settings() -> Settings:
         raise InputError(
             f"{name} is not valid{shown}",
             path=name,
-            expected=wrong["msg"].removeprefix("Value error, ").removeprefix("Input should be "),
+            expected=valid(wrong),
         ) from None
