@@ -1,6 +1,6 @@
 """A language model whose words are a robot's actions, generating inside a rule.
 
-    pip install 'specshield[transformers]'
+    pip install -e '.[transformers]'
     python examples/action_tokens.py           # in process: no service is needed
 
 The model is a GPT-2 with random weights, four words and no idea of the room: a stand-in for a

@@ -1,6 +1,6 @@
 """BabyAI's own bot in its own maze, inside a rule over the rooms that the bot knows nothing of.
 
-    pip install 'specshield[minigrid]'
+    pip install -e '.[minigrid]'
     python examples/minigrid_rooms.py          # in process: no service is needed
 
 The bot goes where its mission says. The rule wants it in one corner of the maze in time, in the opposite one

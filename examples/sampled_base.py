@@ -1,6 +1,6 @@
 """A policy that answers with chunks of base commands, as pi0 does over openpi, inside a rule.
 
-    pip install 'specshield[core]' && pip install --no-deps openpi-client
+    pip install -e '.[core]' && pip install --no-deps openpi-client
     python examples/sampled_base.py            # in process: no service is needed
 
 The policy here is a stand-in: it draws a forward speed and a turn rate at random. For the real one, replace
