@@ -18,6 +18,7 @@ from specshield.recordings import drive
 from specshield.recordings.recording import Recording
 from specshield.recordings.tables import write_csv, write_parquet
 from specshield.robot.dynamics import make_body, step
+from specshield.shipped import MODELS
 from specshield.world.occupancy import OccupancyGrid
 from tests.serving import RunningServer, run_specshield
 
@@ -308,3 +309,7 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     refused = run_specshield(*words, cwd=tmp_path)
     assert refused.returncode == 1
     assert "the rule is broken" in refused.stdout
+    words[3] = str(MODELS / "case1")  # which has no map beside it
+    assert run_specshield(*words, cwd=tmp_path).stderr.startswith(
+        "--policy: the folder does not say which map"
+    )

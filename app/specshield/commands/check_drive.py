@@ -7,10 +7,14 @@ from typing import Annotated
 
 import typer
 
+from specshield.errors import SpecshieldError
+
 
 def check_drive(
     bag: Annotated[Path, typer.Argument(help="A rosbag2: its folder.", show_default=False)],
-    policy: Annotated[str, typer.Option(help="A policy that came with specshield, or the folder of one.")],
+    policy: Annotated[
+        str, typer.Option(help="One that came with specshield, or a folder by LocalShield.save.")
+    ],
     step_seconds: Annotated[
         float,
         typer.Option(help="How long a step is, in seconds.", min=1e-3, max=86_400.0, show_default=False),
@@ -27,7 +31,11 @@ def check_drive(
     from specshield.recordings import drive
 
     folder, driven = Path(policy), drive.read_drive(bag, step_seconds, topic)
-    shield = LocalShield.load(folder) if (folder / "card.json").is_file() else LocalShield.shipped(policy)
+    try:
+        shield = LocalShield.load(folder) if (folder / "card.json").is_file() else LocalShield.shipped(policy)
+    except SpecshieldError as error:
+        error.path = "--policy"
+        raise
     judged = drive.check_drive(shield, driven)
     for line in drive.told(shield, judged, step_seconds):
         typer.echo(line)

@@ -263,8 +263,4 @@ def read_settings() -> Settings:
         name = "REDIS_URL" if field == "redis_url" else f"SPECSHIELD_{field.upper()}"
         secret = field in ("redis_url", "api_key")  # a URL may hold a password
         shown = "" if secret else f": {wrong['input']!r}"
-        raise InputError(
-            f"{name} is not valid{shown}",
-            path=name,
-            expected=valid(wrong),
-        ) from None
+        raise InputError(f"{name} is not valid{shown}", path=name, expected=valid(wrong)) from None
