@@ -186,9 +186,10 @@ def rewards(
     page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/rewards.md"),
 ) -> None:
     """Train the learned policy with the paper's reward and with ours, and compare what comes of them."""
-    from evaluation.rewards import all_of, compare
+    from evaluation.rewards import REWARDS, all_of, compare
 
     _check_page(page)
+    _some(reward, REWARDS, "--reward")
     whole = [int(seed) for seed in _numbers(seeds, "--seeds")]
     compare(all_of(case, reward, whole, updates), runs, out, page)
 

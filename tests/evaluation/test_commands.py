@@ -136,6 +136,7 @@ def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
         ("worlds", "--sensing", "nope"),
         ("results", "--only", "nope"),
         ("curves", "--metres", "0.1,nope"),
+        ("rewards", "--reward", "paper,nope"),
         ("evaluate", "--methods", "ours,nope"),
         ("evaluate", "--methods", "ours@nope"),
     ],
