@@ -121,7 +121,8 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        expected = "a JSON or YAML file; of a map drawn as an image, the YAML beside it"
+        drawn = "; of a map drawn as an image, the YAML beside it" if option == "--map" else ""
+        expected = f"a JSON or YAML file{drawn}"
         raise InputError(f"{path} cannot be read: {reason}", path=option, expected=expected) from None
     try:
         document = text.rstrip().removesuffix("\n---")  # `ros2 topic echo` ends a message with that
