@@ -28,7 +28,7 @@ error here and never a stack overflow in the code that later walks the formula.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any, TypeVar
 
 from specshield.errors import FormulaError, HorizonError
@@ -143,32 +143,24 @@ class _Parser:
                 raise self._unexpected("a formula, a name or a number")
 
     def _infix(self, left: Node, start: int, level: int) -> Node:
-        token = self._token
-        match token.kind:
-            case "and" | "or":
-                children = [self._as_formula(left)]
-                while self._token.kind == token.kind:
-                    self._next()
-                    children.append(self._subformula(level + 1))
-                return self._made((nodes.And if token.kind == "and" else nodes.Or)(tuple(children)), token)
-            case "implies":
-                condition = self._as_formula(left)
-                self._next()
-                return self._made(nodes.Implies(condition, self._subformula(level + 1)), token)
-            case "U":
-                before = self._as_formula(left)
-                self._next()
-                a, b = self._window(token)
-                return self._made(nodes.Until(a, b, before, self._subformula(level + 1)), token)
-            case "<" | "<=" | ">" | ">=" as op:
-                lesser = self._as_term(left, start)
-                self._next()
-                return self._made(nodes.Comparison(op, lesser, self._term(level + 1)), token)
-            case "+" | "-" | "*" | "/" as op:
-                first = self._as_term(left, start)
-                self._next()
-                return self._made(nodes.Arithmetic(op, first, self._term(level + 1)), token)
-        raise AssertionError(token.kind)
+        token, kind = self._token, self._token.kind
+        if level in (nodes.COMPARISON, nodes.SUM, nodes.PRODUCT):
+            make: Callable[..., Node] = nodes.Comparison if level == nodes.COMPARISON else nodes.Arithmetic
+            term = self._as_term(left, start)
+            self._next()
+            return self._made(make(kind, term, self._term(level + 1)), token)
+        first = self._as_formula(left)
+        self._next()
+        if kind == "U":
+            a, b = self._window(token)
+            return self._made(nodes.Until(a, b, first, self._subformula(level + 1)), token)
+        parts = [first, self._subformula(level + 1)]
+        if kind == "implies":
+            return self._made(nodes.Implies(*parts), token)
+        while self._token.kind == kind:
+            self._next()
+            parts.append(self._subformula(level + 1))
+        return self._made((nodes.And if kind == "and" else nodes.Or)(tuple(parts)), token)
 
     def _subformula(self, binding: int) -> Formula:
         return self._as_formula(self._expression(binding))
