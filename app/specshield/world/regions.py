@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -266,8 +266,9 @@ def _crossing_edges(v: Floats) -> tuple[int, int]:
     return -1, -1
 
 
-def region_from_json(spec: Any, path: str) -> Region:
-    """A region of the HTTP contract; MapError with the member's path below `path`.
+def region_from_json(spec: Any, path: str, whole: bool = True) -> Region:
+    """A region of the HTTP contract; MapError with the member's path below `path`. whole: whether it is no
+    member of a union, and so may be a union itself.
 
     {"type": "circle", "center": [x, y], "radius"}, {"type": "rectangle", "min": [x, y], "max": [x, y]},
     {"type": "polygon", "vertices": [[x, y], ...]}, {"type": "union", "members": [the others, ...]}.
@@ -276,30 +277,22 @@ def region_from_json(spec: Any, path: str) -> Region:
     kind = checks.member(spec, "type", path)
     if not isinstance(kind, str) or kind not in KINDS:
         raise checks.wrong("kind of region", f"{path}.type", kind, "one of " + ", ".join(KINDS))
+    if kind == "union" and not whole:
+        told, expected = "a union cannot be a member of a union", "circle, rectangle or polygon"
+        raise MapError(told, path=path, got=kind, expected=expected)
     names = [field.name for field in fields(KINDS[kind])]
     if extra := sorted(set(map(str, spec)) - {"type", *names}):
         told, expected = f"a {kind} has no member {extra[0]!r}", "type, " + ", ".join(names)
         raise MapError(told, path=f"{path}.{extra[0]}", got=extra[0], expected=expected)
     values = [checks.member(spec, name, path) for name in names]
     if kind == "union":
-        return _union_from_json(values[0], path)
+        where = f"{path}.members"
+        given = checks.items(values[0], where, 1, MAX_MEMBERS)
+        values = [[region_from_json(each, f"{where}[{i}]", False) for i, each in enumerate(given)]]
     try:
         return KINDS[kind](*values)
     except MapError as error:
         raise error.at(path) from None
-
-
-def _union_from_json(members: Any, path: str) -> Union:
-    parts: list[Circle | Rectangle | Polygon] = []
-    for i, spec in enumerate(checks.items(members, f"{path}.members", 1, MAX_MEMBERS)):
-        where = f"{path}.members[{i}]"
-        if isinstance(spec, Mapping) and spec.get("type") == "union":
-            told, expected = "a union cannot be a member of a union", "circle, rectangle or polygon"
-            raise MapError(told, path=where, got="union", expected=expected)
-        part = region_from_json(spec, where)
-        assert not isinstance(part, Union)
-        parts.append(part)
-    return Union(tuple(parts))
 
 
 def region_to_json(region: Region) -> dict[str, Any]:
