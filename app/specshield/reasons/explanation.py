@@ -74,13 +74,13 @@ class _Motion:
         than J asks for; else one that keeps all but one, the least late or else the most robust; else the one
         that comes nearest to keeping all, with the conjunct that it keeps least.
         """
-        parts = self.parts()
+        parts, task = self.parts(), self.shield.task
         best, rank = Explanation(str(parts[0]), -math.inf, None), (NOTHING, math.inf)
         for earlier, rows in self.futures():
             if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
                 break  # all further futures are as late or later
             poses = driven(self.shield, self.prefix.poses, rows)
-            samples = self.shield.task.samples(poses, self.prefix.foreseen)
+            samples = task.samples(poses, dict(zip(task.signals, self.prefix.foreseen.T, strict=True)))
             rho = np.array([values_of(part, samples) for part in parts])  # [parts, rows]
             asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):

@@ -61,14 +61,13 @@ class Prefix(NamedTuple):
         is not finite there.
         """
         poses, known = np.concatenate([self.poses, pose[None]]), np.empty(self.view.value.tree.size)
-        _, high = look(self.view, poses, signal_rows(self.task, self.foreseen, len(poses)), known)
+        _, high = look(self.view, poses, self.foreseen, known)
         return bool(high > SATISFIED_ABOVE)
 
     @property
-    def foreseen(self) -> Signals:
-        """The signals to step t, and one more sample: the value that they are taken to keep from then on."""
-        rows = np.concatenate([self.rows, self.held])
-        return {name: rows[:, i] for i, name in enumerate(self.task.signals)}
+    def foreseen(self) -> Floats:
+        """The signals [t + 2, S]: to step t, and the values that they are taken to keep from then on."""
+        return np.concatenate([self.rows, self.held])
 
 
 def prefix_of(task: Task, formula: Formula, view: Boxed[View], poses: Floats, signals: Signals) -> Prefix:
