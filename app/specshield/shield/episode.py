@@ -217,9 +217,7 @@ def decide(
             memory,
             residuals=remembered,
             threshold_left=left if shield.config.threshold_over == "episode" else None,
-            learned=handed_on(
-                shield, taught, int(robot.motion_of[moved]), moved, answer.distribution, nexts, poses[-1]
-            ),
+            learned=handed_on(shield, taught, moved, answer.distribution, nexts, poses[-1]),
             action=action,
             stuck=taught.stuck,
             here=taught.here,

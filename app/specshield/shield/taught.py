@@ -258,13 +258,14 @@ def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Float
 
 
 def handed_on(
-    shield: Shield, taught: Taught, drawn: int, moved: int, distribution: Floats, nexts: Floats, pose: Floats
+    shield: Shield, taught: Taught, moved: int, distribution: Floats, nexts: Floats, pose: Floats
 ) -> bytes | None:
     """`taught` as bytes for the next decision; None if nothing was learned and the session learns nothing by
-    itself. drawn: the motion that was drawn, -1 for a terminal action; for the rest see `remember`.
+    itself. For the arguments see `remember`.
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
+    drawn = int(shield.task.robot.motion_of[moved])  # -1 for a terminal action
     followed = Followed(drawn, *taught.followed[1:])
     if followed.follows and followed.by_chance >= SELDOM:
         chance = partial(chance_of, shield.task.robot.motion_of, distribution, moved, nexts)
