@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from specshield.policy.notices import notices
+from specshield.policy.notices import notices, odd_turns
 from specshield.policy.reachability.policy import Settings
 from specshield.reasons.relaxation import way
 from specshield.robot import robot_from_json
-from specshield.robot.oddity import odd_turns
 from specshield.shield.decision import make_shield
 from specshield.shield.proposal import Proposal
 from specshield.task import make_task

@@ -4,7 +4,8 @@ rule asks for nothing, or that turns of its robot look like degrees.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from specshield.errors import InfeasibleStart, MapError, SampleError
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import contradiction, idle
 from specshield.reasons.relaxation import way
-from specshield.robot.oddity import odd_turns
+from specshield.robot import Robot
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.episode import start
@@ -28,6 +29,14 @@ MOST_SEARCHED = 4  # of those from which it has no future
 def notices(policy: Proposer) -> tuple[str, ...]:
     """One sentence each. The starts are drawn from free space, the same each time."""
     return (*odd_turns(policy.task.robot), *_of_rule(policy))
+
+
+def odd_turns(robot: Robot) -> Iterator[str]:
+    """What looks odd about the robot's turns, one sentence each."""
+    for name, turn in ((action.name, action.rotate) for action in robot.actions):
+        if abs(turn) > math.pi:
+            meant = f"{turn:g} degrees would be {math.radians(turn):.4g} radians"
+            yield f"the action {name!r} turns by {turn:g} radians, which is more than half a turn; {meant}"
 
 
 def _of_rule(policy: Proposer) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 from specshield.arrays import Floats
-from specshield.robot.actions import Robot
 from specshield.robot.dynamics import Body, longest_motions
 from specshield.world.occupancy import OccupancyGrid
 
@@ -29,11 +28,3 @@ def oddities(grid: OccupancyGrid, body: Body, poses: Floats) -> Iterator[str]:
         moved = math.hypot(x - last_x, y - last_y)
         if moved > JUMP and moved > (most := longest_motions(body)[0]) + JUMP:
             yield f"the pose is {moved:.3g} m from the one before; the robot's longest motion is {most:g} m"
-
-
-def odd_turns(robot: Robot) -> Iterator[str]:
-    """What looks odd about the robot's turns, one sentence each."""
-    for name, turn in ((action.name, action.rotate) for action in robot.actions):
-        if abs(turn) > math.pi:
-            meant = f"{turn:g} degrees would be {math.radians(turn):.4g} radians"
-            yield f"the action {name!r} turns by {turn:g} radians, which is more than half a turn; {meant}"
