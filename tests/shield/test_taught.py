@@ -22,7 +22,7 @@ from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield import episode
 from specshield.shield.caution.experience import FORMAT, Seen
 from specshield.shield.episode import Carry, Config, decide, make_shield
-from specshield.shield.surprise.contact import Followed, contact_of
+from specshield.shield.surprise.contact import NEAR, Followed, contact_of
 from specshield.shield.surprise.doubt import recovered
 from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map, wary
@@ -648,6 +648,7 @@ def test_an_arc_that_something_stops_before_its_turn_does_not_tell_a_caller_that
     body = make_body(robot, room().task.grid)
     before, after = np.array([1.0, 1.0, 0.0]), np.array([1.18, 1.0, 0.0])
     foreseen = np.array([step(body, *before, motion) for motion in range(3)])
-    met, now = contact_of(body, Followed(drawn=drawn, by_chance=by_chance), before, after, foreseen)
+    followed = Followed(drawn=drawn, by_chance=by_chance)
+    met, now = contact_of(body, followed, before, after, foreseen, NEAR, False)
     assert met == -1
     assert now.follows == follows

@@ -57,13 +57,7 @@ class Followed(NamedTuple):
 
 
 def contact_of(
-    body: Body,
-    followed: Followed,
-    before: Floats,
-    after: Floats,
-    foreseen: Floats,
-    near: Near = NEAR,
-    again: bool = False,
+    body: Body, followed: Followed, before: Floats, after: Floats, foreseen: Floats, near: Near, again: bool
 ) -> tuple[int, Followed]:
     """The motion that stopped short between two poses (3,), -1 for none; and `followed` after this step.
 
