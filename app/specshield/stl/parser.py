@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from specshield.errors import FormulaError, HorizonError
 from specshield.stl import formula as nodes
@@ -225,7 +225,8 @@ class _Parser:
         b = self._bound()
         self._take("]", "']' after the window's bounds, which are steps without a unit")
         if a > b:
-            raise self._error(f"the window [{a},{b}] is empty", opening, "a <= b", got=[a, b])
+            problem = f"the window [{a},{b}] is empty at position {opening.position}"
+            raise wrong(problem, [a, b], "a <= b", opening.position)
         return a, b
 
     def _bound(self) -> int:
@@ -244,8 +245,8 @@ class _Parser:
             raise self._too_deep(token)
         limit = self._max_horizon
         if limit is not None and isinstance(node, Formula) and node.horizon > limit:
-            problem = f"a horizon of {node.horizon} steps"
-            raise self._error(problem, token, f"at most {limit} steps", HorizonError, got=node.horizon)
+            problem = f"a horizon of {node.horizon} steps at position {token.position}"
+            raise wrong(problem, node.horizon, f"at most {limit} steps", token.position, HorizonError)
         return node
 
     def _too_deep(self, token: Token) -> FormulaError:
@@ -260,15 +261,10 @@ class _Parser:
         return self._error(f"unexpected '{_clip(token.text)}'", token, expected + hint)
 
     def _error(
-        self,
-        problem: str,
-        token: Token,
-        expected: str,
-        error: type[FormulaError] = FormulaError,
-        got: Any = None,
+        self, problem: str, token: Token, expected: str, error: type[FormulaError] = FormulaError
     ) -> FormulaError:
-        found = _clip(token.text) if got is None else got
-        return wrong(f"{problem} at position {token.position}", found, expected, token.position, error)
+        told = f"{problem} at position {token.position}"
+        return wrong(told, _clip(token.text), expected, token.position, error)
 
 
 def _hint(word: Token, following: Token) -> str:
