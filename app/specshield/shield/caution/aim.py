@@ -66,7 +66,7 @@ def aim(
     size, count = len(parts.value.kind), len(shield.task.robot.motions)
     still, short, settled = np.empty(size, np.bool_), np.empty(size, np.bool_), np.empty(size)
     asked, due = np.empty(size, np.int64), np.empty(size, np.int64)
-    arrays = still, settled, asked, due, prefix.t, short, leaves, whole, tried.motions
+    arrays = still, settled, asked, due, prefix.t, short, prefix.known, leaves, whole, tried.motions
     now = Open(*arrays, count, follows)
     if before is not None:
         find_open(parts, prefix.known, prefix.t, before.visits, still, settled)
@@ -74,14 +74,14 @@ def aim(
         best, _ = _best_open(parts, now, before.early, margin)
         return before._replace(best=best, kept=best.robustness > margin)
     any_visit = np.array([SATISFIED_ABOVE] * size)  # numpy is slow for so few
-    aimed = _aim(shield, care, prefix, parts, now, any_visit, np.zeros(size, np.int64))
+    aimed = _aim(shield, care, parts, now, any_visit, np.zeros(size, np.int64))
     if True not in short.tolist():
         return aimed
     # Places that were visited with less than the margin are visited again, all of them or else each of which
     # that is possible with no less margin, and with half of the slack for all that is open beside it.
     places, half, robust = short.copy(), asked // 2, any_visit + care.margin
     for some in (places, *np.eye(size, dtype=np.bool_)[places]):
-        tighter = _aim(shield, care, prefix, parts, now, np.where(some, robust, aimed.visits), half)
+        tighter = _aim(shield, care, parts, now, np.where(some, robust, aimed.visits), half)
         if tighter.margin >= aimed.margin and tighter.kept.any():
             aimed = tighter
             if some is places:
@@ -90,19 +90,13 @@ def aim(
 
 
 def _aim(
-    shield: Shield,
-    care: Care,
-    prefix: Prefix,
-    parts: Boxed[Conjuncts],
-    now: Open,
-    visits: Floats,
-    sooner: Ints,
+    shield: Shield, care: Care, parts: Boxed[Conjuncts], now: Open, visits: Floats, sooner: Ints
 ) -> Aimed:
     """`aim`, where a past visit counts if its robustness was above its conjunct's entry of `visits` (K,), and
     the slack is not lowered below `sooner` (K,).
     """
     margin, asking = SATISFIED_ABOVE + care.margin, (care.noise, care.stride, care.least, care.chance)
-    best, had = _best_asked(parts, now, prefix.known, asking, visits, margin)
+    best, had = _best_asked(parts, now, asking, visits, margin)
     early = now.asked.copy()
     if not had:
         best, had = _best_open(parts, now, early := sooner, margin)
@@ -127,7 +121,8 @@ class Open(NamedTuple):
 
     still: which are open. settled: above which robustness each counts as settled. asked: the slack that is
     asked for [steps]. due: in how many steps each is due, NEVER for one that is not. short: which have a past
-    visit that lacks the margin and can be made again with it. motion_count: how many motions the robot has.
+    visit that lacks the margin and can be made again with it. known: the leaves at the steps to t.
+    motion_count: how many motions the robot has.
     """
 
     still: Bools
@@ -136,6 +131,7 @@ class Open(NamedTuple):
     due: Ints
     t: int
     short: Bools
+    known: Floats
     leaves: Floats
     whole: Floats
     motions: Ints
@@ -145,17 +141,12 @@ class Open(NamedTuple):
 
 @kernel
 def _best_asked(
-    boxed: Boxed[Conjuncts],
-    now: Open,
-    known: Floats,
-    care: tuple[Noise, float, int, float],
-    visits: Floats,
-    margin: float,
+    boxed: Boxed[Conjuncts], now: Open, care: tuple[Noise, float, int, float], visits: Floats, margin: float
 ) -> tuple[Best, bool]:
     """Fills in `still`, `settled`, `asked`, `due` and `short` of `now`, then returns `_best_open` for what is
     asked. care: noise, stride, least and chance of the `Care`. A window keeps at least half its length.
     """
-    (still, settled, asked, due, t, short), (noise, stride, least, chance) = now[:6], care
+    (still, settled, asked, due, t, short, known), (noise, stride, least, chance) = now[:7], care
     parts = boxed.value
     find_open(boxed, known, t, np.full(settled.shape[0], margin), still, settled)
     for k in range(still.shape[0]):
