@@ -16,7 +16,7 @@ from specshield.policy.extent import COARSEST
 from specshield.policy.progress import Rules, goals_of, make_rules
 from specshield.policy.reachability.latest import LEAST_LATE, MOST_LATE, phases_of, time_tables
 from specshield.policy.reachability.stepwise import state_count, step_tables
-from specshield.policy.reachability.tables import LATE, Tables
+from specshield.policy.reachability.tables import Tables
 from specshield.policy.shape import MAX_HEADINGS, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.task import Task
@@ -59,7 +59,7 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, bits.shape[2], -(-state_count(rules) // 8))
         check_fit(cell, task, pitch, bits, bits.shape == size, f"bits {list(size)}")
         return step_tables(rules, task.horizon, cell, bits, pitch)
-    late = _late_of(tensors, of)
+    late = _number(tensors, f"{of}late", MOST_LATE, LEAST_LATE)  # versions before 0.2 did not write it
     cell, code, table = named_arrays(
         tensors, {f"{of}cell": (np.int32, 2), f"{of}code": (np.uint16, 3), f"{of}table": (np.int32, 2)}
     )
@@ -67,30 +67,27 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
     wanted = f"code [tables, cells, {code.shape[2]}], table [{len(phases)}, {sets}]"
     check_fit(cell, task, pitch, code, fits, wanted)
-    return time_tables(rules, phases, cell, code, table, pitch)._replace(late=late)
-
-
-def _late_of(tensors: Tensors, of: str) -> float:
-    """How late the tables may be [steps]. Files of versions before 0.2 do not say it."""
-    kept = tensors.pop(f"{of}late", None)
-    if kept is None:
-        return LATE
-    found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
-    if not MOST_LATE <= found <= LEAST_LATE:
-        raise _other_kind(f"{of}late", found, f"float64, one number from {MOST_LATE} to {LEAST_LATE}")
-    return found
+    tables = time_tables(rules, phases, cell, code, table, pitch)
+    return tables if late is None else tables._replace(late=late)
 
 
 def _pitch_of(tensors: Tensors, task: Task, asked: float) -> float:
     """The lattice's pitch [m]: one that had to grow is in the file, the others go by the number of cells."""
-    kept, cell = tensors.pop("pitch", None), tensors.get("cell")
+    kept, cell, fine = _number(tensors, "pitch", asked, COARSEST * asked), tensors.get("cell"), asked / 3.0
     if kept is not None:
-        found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
-        if not asked <= found <= COARSEST * asked:
-            raise _other_kind("pitch", found, f"float64, one number from {asked:g} to {COARSEST * asked:g}")
-        return found
-    fine = asked / 3.0
+        return kept
     return fine if cell is not None and cell.shape == side_of(task.grid, fine) else asked
+
+
+def _number(tensors: Tensors, name: str, low: float, high: float) -> float | None:
+    """Takes the array `name`, one number from low to high, out of `tensors`; None if it is not there."""
+    kept = tensors.pop(name, None)
+    if kept is None:
+        return None
+    found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
+    if not low <= found <= high:
+        raise _other_kind(name, found, f"float64, one number from {low:g} to {high:g}")
+    return found
 
 
 def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
