@@ -21,7 +21,7 @@ from specshield.stl import And, Atom, Comparison, Formula, Not, Or
 from specshield.stl.robustness import difference
 from specshield.stl.terms import interval
 from specshield.task import Task
-from specshield.world.regions import area_distance, pack_areas
+from specshield.world.regions import pack_areas, signed_distance
 
 # Chosen by hand: the ways to one goal, and one region, take 0.1 s at most.
 MOST_SQUARES = 150_000  # a larger map has larger squares
@@ -89,9 +89,8 @@ class Ground:
             area = self.task.areas[name]
             ahead, left = self.task.robot.offset
             apart = math.hypot(area.point[0] - ahead, area.point[1] - left)
-            flat = np.concatenate([self.centres, np.zeros((*self.free.shape, 1))], axis=-1)
-            still = type(area)(area.region, area.grown)  # measured at the footprint's centre
-            value, wide = area_distance(still, flat), self.span + apart + beyond
+            value = signed_distance(area.region, self.centres) + area.grown  # at the footprint's centre
+            wide = self.span + apart + beyond
         elif name in ("x", "y"):
             value, wide = self.centres[..., int(name == "y")], self.span + off + beyond
         elif name == "theta":
