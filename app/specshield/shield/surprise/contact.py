@@ -17,7 +17,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.portable import arctan2
 from specshield.robot.body import centre
-from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
+from specshield.robot.dynamics import TOUCH, Body, displacement, displacements, wrap
 from specshield.shield.caution.experience import SELDOM
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
@@ -106,14 +106,10 @@ def _short(body: Body, before: Floats, after: Floats, foreseen: Floats, near: Ne
     cos, sin = math.cos(before[2]), math.sin(before[2])
     dx, dy = after[:2] - before[:2]
     ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
-    found = np.zeros(len(foreseen), np.bool_)
-    if abs(aside) > near[0] or abs(wrap(after[2] - before[2])) > near[1]:
-        return found
-    for motion in range(len(foreseen)):
-        far, _ = displacement(body, motion)
-        reached = math.hypot(*(foreseen[motion, :2] - before[:2]))
-        found[motion] = far * ahead > 0.0 and abs(ahead) < reached - near[0]
-    return found
+    straight = abs(aside) <= near[0] and abs(wrap(after[2] - before[2])) <= near[1]
+    far, _ = displacements(body)
+    reached = np.hypot(*(foreseen[:, :2] - before[:2]).T)
+    return np.asarray(straight & (far * ahead > 0.0) & (abs(ahead) < reached - near[0]))
 
 
 def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tuple[int, Ints]]:
