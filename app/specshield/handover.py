@@ -1,17 +1,20 @@
-"""What a session keeps at a switch of rule, map or robot, and how its rules and explanations are shown."""
+"""What a session keeps at a switch of rule, map or robot, what it checks of a step beside the shield, and how
+its rules and explanations are shown.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from specshield.errors import StepConflict
+from specshield.errors import SampleError, StepConflict
 from specshield.shield.decision import Carry, Decision
 from specshield.shield.taught import Taught
+from specshield.task import LARGEST, SIGNAL
 
 E = TypeVar("E")
 NEVER = -2  # the step of a decision that precedes no other, so that no pose is compared with what it foresaw
@@ -52,6 +55,18 @@ def check_main_task(over: bool, told: bool) -> None:
     if over and not told:
         said, expected = "an earlier step said that the main task is done, which cannot be taken back", "true"
         raise StepConflict(said, path="main_task_done", got=False, expected=expected)
+
+
+def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
+    """Raises SampleError for a signal that none of a session's rules reads, or a value out of range."""
+    for name, value in signals.items():
+        where = f"signals.{name}"
+        if name not in names:
+            declared = f"one of {sorted(names)}, which the session's rules read"
+            expected = declared if names else "no signals: the rule reads none"
+            raise SampleError(f"unknown signal {name!r}", path=where, got=name, expected=expected)
+        if not -LARGEST <= value <= LARGEST:
+            raise SampleError("a signal is out of range", path=where, got=str(value), expected=SIGNAL)
 
 
 def finite(value: float) -> float | None:

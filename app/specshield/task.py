@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Any, TypeVar, cast
@@ -180,18 +180,6 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
                 "a signal's initial value has to be a number in range", path=where, got=value, expected=SIGNAL
             )
     return {name: float(value) for name, value in signals.items()}
-
-
-def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
-    """Raises SampleError for a signal that none of a session's rules reads, or a value out of range."""
-    for name, value in signals.items():
-        where = f"signals.{name}"
-        if name not in names:
-            declared = f"one of {sorted(names)}, which the session's rules read"
-            expected = declared if names else "no signals: the rule reads none"
-            raise SampleError(f"unknown signal {name!r}", path=where, got=name, expected=expected)
-        if not -LARGEST <= value <= LARGEST:
-            raise SampleError("a signal is out of range", path=where, got=str(value), expected=SIGNAL)
 
 
 def _check_name(name: str, path: str, error: type[InputError]) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from specshield.errors import SampleError
+from specshield.handover import check_signals
 from specshield.robot import STRETCH
-from specshield.task import check_signals, make_task
+from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
 TASK = make_task(

@@ -34,7 +34,7 @@ from specshield.shield import episode
 from specshield.shield.decision import Shield
 from specshield.shield.signals import any_signal
 from specshield.shield.surprise.slip import SAME_POSE
-from specshield.task import Task, check_signals
+from specshield.task import Task
 
 if TYPE_CHECKING:
     from specshield.local.shield import LocalShield
@@ -124,7 +124,7 @@ class LocalSession:
             wire.seconds_value(deadline, "deadline")
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
-        check_signals(self._first, sent)  # signals of the session's other rules are kept too
+        handover.check_signals(self._first, sent)  # signals of the session's other rules are kept too
         x_t = self._at(pose)
         held = self._held(sent)
         made = episode.decide(

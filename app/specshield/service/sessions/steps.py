@@ -15,6 +15,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
+from specshield.handover import check_signals
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
@@ -27,7 +28,6 @@ from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
-from specshield.task import check_signals
 
 ROOM = 64 << 20  # [bytes] of sessions kept in memory: some 4,000. Chosen by hand.
 WATCHED = 32  # decisions that are made in threads after a long one. Chosen by hand.
