@@ -7,7 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by, undo_motion, undoing_motions
+from specshield.policy.undo import (
+    IMPOSSIBLE,
+    NOT_NEEDED,
+    move_back,
+    turn_by,
+    turning_motion,
+    undo_motion,
+    undoing_motions,
+)
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import (
     calmest_motion,
@@ -16,7 +24,6 @@ from specshield.robot.dynamics import (
     make_body,
     motion_count,
     swing_radius,
-    turning_motion,
 )
 from specshield.world.occupancy import OccupancyGrid
 

@@ -1,4 +1,4 @@
-"""The motions that take another one back, as nearly as the robot can."""
+"""The motions that turn the robot, or take another motion back, as nearly as the robot can."""
 
 from __future__ import annotations
 
@@ -14,6 +14,16 @@ from specshield.robot.dynamics import Body, displacement, motion_count, step, wr
 SAME_ANGLE = 1e-9  # [rad] angles that differ by less are the same: far above rounding, far below any turn
 SAME_POSE = 1e-6  # [m, rad] poses that differ by less are the same: ten times what a contact leaves (SKIN)
 NOT_NEEDED, IMPOSSIBLE = -1, -2  # in place of a motion
+
+
+@leaf
+def turning_motion(body: Body) -> int:
+    """The first motion that turns the robot and leaves it where it is, -1 where there is none."""
+    for motion in range(motion_count(body)):
+        ahead, turn = displacement(body, motion)
+        if ahead == 0.0 and turn != 0.0:
+            return motion
+    return -1
 
 
 @leaf

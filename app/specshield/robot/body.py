@@ -86,15 +86,6 @@ def swing_radius(body: Body) -> float:
     return float(body.radius + math.hypot(body.offset_x, body.offset_y))
 
 
-@leaf
-def turning_motion(body: Body) -> int:
-    """The first motion that turns the robot and leaves it where it is, -1 where there is none."""
-    for motion in range(body.translate.shape[0]):
-        if body.translate[motion] == 0.0 and body.rotate[motion] != 0.0:
-            return motion
-    return -1
-
-
 def calmest_motion(body: Body) -> int:
     """The motion that stands still, or else the smallest turn on the spot, or else the shortest move."""
     travel = np.abs(body.translate) + 1e-3 * np.abs(body.rotate)

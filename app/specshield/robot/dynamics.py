@@ -10,9 +10,9 @@ its dynamics knows what each of them does. A dynamics offers:
     free_distance, swing_radius    how much room a place has, and how much the robot needs to turn there
     motion_count, displacement,    how many motions there are, where they lead from, and how far
     displacements, longest_motions
-    turning_motion, calmest_motion what turns it on the spot, and what comes nearest to standing still
+    calmest_motion                 what comes nearest to standing still
 
-Which motions take another one back (policy/undo.py) follows from the displacements.
+Which motions turn it on the spot, or take another one back (policy/undo.py), follows from the displacements.
 
 All but `make_body`, `displacements` and `calmest_motion` are compiled, anew for each type of `Body`, together
 with their callers: nothing is dispatched while a decision is made.
@@ -27,7 +27,6 @@ from specshield.robot.body import (
     make_body,
     motion_count,
     swing_radius,
-    turning_motion,
     wrap,
 )
 from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap

@@ -39,9 +39,10 @@ from specshield.policy.progress.recall import residuals
 from specshield.policy.reachability.stored import check_fit
 from specshield.policy.shape import headings_of, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
+from specshield.policy.undo import turning_motion
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
-from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
+from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.rule.residual import all_of
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look

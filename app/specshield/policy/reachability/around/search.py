@@ -44,18 +44,10 @@ from specshield.policy.reachability.tables import (
 )
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
 from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
-from specshield.policy.undo import IMPOSSIBLE
+from specshield.policy.undo import IMPOSSIBLE, turning_motion
 from specshield.robot.barred import is_barred
 from specshield.robot.contact import overlap
-from specshield.robot.dynamics import (
-    around,
-    longest_motions,
-    motion_count,
-    simulate,
-    step,
-    step_from,
-    turning_motion,
-)
+from specshield.robot.dynamics import around, longest_motions, motion_count, simulate, step, step_from
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
 POSES = 16_384  # that one search may make, in some 10 ms
