@@ -15,6 +15,7 @@ from evaluation.models import courteous, follower
 from evaluation.results import markdown, share
 from evaluation.runs import Record
 from evaluation.statistics import clopper_pearson, compared, extra_steps, mean_of
+from evaluation.writeup import write_page
 from specshield.sim.cases import Case
 
 CASES = ("case1", "case2")
@@ -53,7 +54,7 @@ def measure(runs: int, seed: int, out: Path, page: Path, processes: int) -> None
             records = evaluate(experiment, runs, METHODS, out / model / name, processes)
             parts.append(f"{name}, {runs} runs:\n\n{_table(experiment.setting.case, model, records)}")
             print(f"{model}, {parts[-1]}\n", flush=True)
-    page.write_text("\n\n".join(parts) + "\n")
+    write_page(page, parts)
 
 
 def _table(case: Case, model: str, records: Sequence[Record]) -> str:

@@ -20,6 +20,7 @@ from evaluation.pages.tables import difference
 from evaluation.results import markdown, share
 from evaluation.runs import Record
 from evaluation.statistics import NOTHING, clopper_pearson, compared, mean_of
+from evaluation.writeup import write_page
 
 FAMILIES = ("bot", "goal-seeker", "jumper", "learned", "rover", "unsteered")
 SLACKS = ("ours", "ours@0/25", "proportional@0/25", "adaptive@0/25")  # ours: a slack of 0, projection alone
@@ -56,9 +57,9 @@ def measure(
         command += f" --model {','.join(models)}"
     limit = experiment.main.limit
     about = ABOUT.format(command=command, models=len(models), cases=len(cases), runs=runs, limit=limit)
-    text = "\n\n".join([about, *tables(found, limit), *verdict(found, limit)])
-    print(text)
-    page.write_text(text + "\n")
+    parts = [about, *tables(found, limit), *verdict(found, limit)]
+    print("\n\n".join(parts))
+    write_page(page, parts)
 
 
 Found = Mapping[tuple[str, str], Sequence[Record]]

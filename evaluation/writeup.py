@@ -72,7 +72,7 @@ def write_up(folder: Path, page: Path) -> None:
     texts["cases"] = one_by_one(parts["cases"], drawn, beside / "cases.md")
     for name, text in texts.items():
         if parts[name]:
-            _write(
+            write_page(
                 beside / f"{name}.md",
                 [
                     f"# {TITLES[name]}",
@@ -86,7 +86,7 @@ def write_up(folder: Path, page: Path) -> None:
     others = {title: beside / f"{name}.md" for name, title in TITLES.items()}
     others |= {UNTOLD: beside / "uncertainty.md"}  # by `python -m evaluation uncertainty`
     others |= {title: page.with_name(f"{name}.md") for name, title in OTHERS.items()}
-    _write(page, summary(parts["cases"], linked(page, others), parts["noise"], parts["tasks"]))
+    write_page(page, summary(parts["cases"], linked(page, others), parts["noise"], parts["tasks"]))
 
 
 def pages_of(results: Results) -> set[str]:
@@ -116,7 +116,7 @@ def _methods(found: Iterable[Results]) -> list[str]:
     return [one["method"] for results in found for one in results["methods"]]
 
 
-def _write(page: Path, parts: Iterable[str]) -> None:
+def write_page(page: Path, parts: Iterable[str]) -> None:
     """Writes the page. A link to a page that is not there is its words alone."""
     text = "\n\n".join(part for part in parts if part) + "\n"
 
