@@ -32,7 +32,8 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     found = [each for each in images if each.suffix.lower() in (".pgm", ".png") and each.is_file()]
     if not found:
         expected = "the PGM or PNG that the YAML names, or one called like the YAML"
-        raise MapError("its image is not beside it", path="image", got=str(path), expected=expected)
+        told = "the map's image is not beside its YAML"
+        raise MapError(told, path="image", got=str(path), expected=expected)
     grid, _ = parse(metadata, found[0].read_bytes())
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_bytes()) if named.is_file() else {}

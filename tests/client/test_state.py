@@ -290,7 +290,7 @@ FAILS = "no way was found after it that keeps the rule; the best way found does 
     [
         ([-0.3, 4], f"{FAILS}: it comes 4 steps too late"),
         ([-0.3, 1], f"{FAILS}: it comes 1 step too late"),
-        ([-0.3, None], f"{FAILS}: it misses it by 0.3"),
+        ([-0.3, None], f"{FAILS}: it falls short by 0.3"),
         ([None, None], "no way was found that keeps F[50,100] Region2"),
         ([-0.3, None, "'A' is not met"], f"{FAILS}: 'A' is not met"),
         ([0.05, None, "a way is known that keeps the rule"], "a way is known that keeps the rule"),

@@ -430,7 +430,7 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
     (tmp_path / "newer.bmp").touch()  # of a kind that is not read
     for named in ("newer.pgm", "newer.bmp"):
         (tmp_path / "floor.yaml").write_text(metadata.replace("newer.pgm", named))
-        with pytest.raises(MapError, match="its image is not beside it"):
+        with pytest.raises(MapError, match="image is not beside its YAML"):
             read_map_files(tmp_path / "floor.yaml")
     (tmp_path / "house.json").write_text('{"rooms": []}')  # which is YAML too, and no map_server's
     (tmp_path / "newer.pgm").write_bytes(image)

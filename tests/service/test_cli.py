@@ -121,13 +121,13 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "serve",
             {"SPECSHIELD_MODELS_DIR": "{folder}/none"},
             "SPECSHIELD_MODELS_DIR is not valid: '",
-            "a folder that is there",
+            "a folder that exists",
         ),
         (
             "worker",
             {"SPECSHIELD_MAPS_DIR": "{folder}/file"},
             "SPECSHIELD_MAPS_DIR is not valid: '",
-            "a folder that is there",
+            "a folder that exists",
         ),
         ("serve", {"SPECSHIELD_WORKER": "yep"}, "SPECSHIELD_WORKER is not valid: 'yep'", "true or false"),
         (

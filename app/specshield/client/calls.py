@@ -300,7 +300,8 @@ def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> d
     if (policy_id is None) == (policy_ids is None):
         raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
     if isinstance(policy_ids, str) or not isinstance(policy_ids, Iterable | None):  # letters are no ids
-        raise InputError("this is no list", path="policy_ids", got=policy_ids, expected="ids or names")
+        told, expected = "policy_ids is not a list", "a list of ids or names"
+        raise InputError(told, path="policy_ids", got=policy_ids, expected=expected)
     return {"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)}
 
 

@@ -135,7 +135,7 @@ class Explanation:
             return f"{told}: it comes {_steps(self.late_by)} too late"
         if self.robustness is None:
             return f"no way was found that keeps {self.conjunct}"
-        return f"{told}: it misses it by {abs(self.robustness):.3g}"
+        return f"{told}: it falls short by {abs(self.robustness):.3g}"
 
     @property
     def is_kept(self) -> bool:

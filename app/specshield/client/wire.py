@@ -211,7 +211,7 @@ def check_flags(**flags: object) -> None:
     """Raises InputError unless each is True, False or None."""
     for name, flag in flags.items():
         if (flag.tolist() if hasattr(flag, "tolist") else flag) not in (True, False, None):
-            raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
+            raise InputError(f"{name} is not a boolean", path=name, got=flag, expected="True or False")
 
 
 def seconds_value(seconds: object, name: str) -> float:

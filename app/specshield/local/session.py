@@ -259,7 +259,8 @@ class LocalSession:
         """The pose to which the last decision's action leads. Raises HistoryGap without such a decision."""
         last = self._decisions.get(self.t - 1)
         if last is None:
-            raise HistoryGap(f"nothing says where the robot is at step {self.t}", path="pose", expected="x_t")
+            told, expected = f"nothing says where the robot is at step {self.t}", f"its pose at step {self.t}"
+            raise HistoryGap(told, path="pose", expected=expected)
         return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:

@@ -145,7 +145,7 @@ class _Motion:
         words = in_words(conjunct, row, self.prefix.t, late)
         others = [f"'{part}'" for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE]
         unit = " m" if set(conjunct.names) <= {"x", "y", *task.areas} else ""
-        missed = f"it misses it by {abs(rho[i]):.3g}{unit}"
+        missed = f"it falls short by {abs(rho[i]):.3g}{unit}"
         if words is None:
             if len(parts) == 1:
                 return None

@@ -169,7 +169,7 @@ class Settings(BaseSettings):
     @classmethod
     def _is_there(cls, folder: Path) -> Path:
         if not folder.is_dir():
-            raise ValueError("a folder that is there, or the variable not set")
+            raise ValueError("a folder that exists, or the variable not set")
         return folder
 
     @field_validator("redis_url")
@@ -180,7 +180,7 @@ class Settings(BaseSettings):
             if store is not None and not is_cluster(str(url)):
                 store.connection_pool.make_connection()  # checks all options, and opens nothing yet
         except (ValueError, TypeError, *FAILURES):  # the last for a `protocol` that there is not
-            raise ValueError(f"a URL as {FORMS}") from None
+            raise ValueError(f"a URL such as {FORMS}") from None
         return url
 
     @field_validator("store_replicas")
@@ -201,7 +201,7 @@ class Settings(BaseSettings):
     @classmethod
     def _are_names(cls, names: str) -> str:
         if not all(AUTHORITY.fullmatch(name) for name in _listed(names)):
-            raise ValueError("names as robots.example or robots.example:8443, separated by commas")
+            raise ValueError("names such as robots.example or robots.example:8443, separated by commas")
         return names
 
     @property

@@ -52,7 +52,7 @@ def verify(file: Path, settings: Settings) -> int:
             print(f"from step {config.begins}, windows from step {config.origin}: {config.spec.formula}")
         print(f"map {config.map_id}")
         print(f"policies {', '.join(config.policy_ids)}")
-        print(f"decided by specshield {config.version or 'of a version that it does not tell'}")
+        print(f"decided by specshield {config.version or 'of a version that the record does not name'}")
     print("the chain is whole: no byte was changed since it was sealed")
     print(f"seal {found.seal}")
     try:
@@ -133,7 +133,8 @@ def _again(
     config, names = found.configs[rule], found.names[rule]
     rows = found.rows[config.origin : t + 1, : 3 + len(names)]
     if len(kept.rows) != len(config.actions):
-        raise InputError(f"step {t} is of {len(kept.rows)} actions", t=t)
+        told = f"step {t} has {len(kept.rows)} actions, and the robot has {len(config.actions)}"
+        raise InputError(told, t=t)
     asked = kept.asked(rows[-1], names)
     if not history.agree(np.array(asked.pose), rows[-1, :3]).all():
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)

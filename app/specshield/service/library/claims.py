@@ -173,7 +173,8 @@ class Claimed:
         """Raises NameTaken if something else than `id` has the name, InputError if nothing may have it."""
         shipped = {each: known.id for each, known in self._named.items()}
         if files.HASH.fullmatch(name):
-            raise InputError("this is the form of an id", path="name", got=name, expected="another name")
+            told, expected = "a name cannot have the form of an id", "another name"
+            raise InputError(told, path="name", got=name, expected=expected)
         own = [each for each, its in shipped.items() if its == id]
         if own and name not in own:
             told, expected = "what came with the server keeps its name", f"'{own[0]}', or no name"

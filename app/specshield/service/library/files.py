@@ -99,11 +99,9 @@ def check_free(folder: Path, wanted: int) -> None:
     except OSError as error:
         raise unusable(error) from error
     if free < wanted:
-        expected = (
-            f"at least {wanted} free bytes with what SPECSHIELD_DISK_RESERVE_BYTES keeps: delete something"
-        )
+        expected = f"at least {wanted} free bytes, SPECSHIELD_DISK_RESERVE_BYTES included: delete something"
         raise InsufficientStorage(
-            "the server's disk is full but for its reserve", got=free, expected=expected
+            "the server's disk is full, apart from its reserve", got=free, expected=expected
         )
 
 

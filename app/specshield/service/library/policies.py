@@ -140,7 +140,7 @@ class Policies(Claimed):
         size = len(files.to_json(spec))
         if size > self._max_spec:
             told = "the spec is too large"
-            expected = f"at most {self._max_spec} bytes, without the regions that the formula does not name"
+            expected = f"at most {self._max_spec} bytes; only regions that the formula names count"
             raise InputError(told, path="spec", got=f"{size} bytes as JSON", expected=expected)
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)

@@ -264,4 +264,4 @@ def missing(key: str) -> NotFound:
 def contended(key: str) -> Conflict:
     id = shown(key)
     told = f"several callers write to session {id!r} at once"
-    return Conflict(told, path="id", got=id, expected="one caller a session")
+    return Conflict(told, path="id", got=id, expected="one caller for each session")

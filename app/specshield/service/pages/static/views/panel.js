@@ -35,7 +35,7 @@ function whyNot(decision, action, measured) {
   if (told && told.robustness > 0) return `${told.conjunct} could still be kept, but not with ${inHand(decision)} in reserve`;
   if (told) {
     const late = told.late_by ? `it comes ${told.late_by} ${told.late_by === 1 ? "step" : "steps"} too late` : null;
-    const misses = told.robustness === null ? null : `it misses it by ${Math.abs(told.robustness).toFixed(2)}`;
+    const misses = told.robustness === null ? null : `it falls short by ${Math.abs(told.robustness).toFixed(2)}`;
     const found = told.detail ?? [late, misses].filter(Boolean).join(", ");
     if (!found) return `no way was found that keeps ${told.conjunct}`;
     return `no way was found after it that keeps the rule; the best way found does not keep '${told.conjunct}': ${found}`;
