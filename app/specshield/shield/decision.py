@@ -36,9 +36,10 @@ class Config:
     uncertainty: None takes f for exact, as the paper does. Otherwise margin and slack follow from what the
     session knows and learns of its robot, and the two settings above are lower limits. threshold_over:
     whether delta holds at each `step` or over the whole `episode`. learn_map: whether a motion that stops
-    short marks what it ran into. map_memory: after how many steps an `occupied` point is forgotten; None:
-    never. any_signal: J asks that the rule be kept whatever the signals do, if some action allows that.
-    Otherwise, and without this setting, signals are taken to keep their values, as in the paper.
+    short marks what it ran into. map_memory: after how many steps an `occupied` point is forgotten; None: no
+    point is forgotten because of its age. any_signal: J asks that the rule be kept whatever the signals do,
+    if some action allows that. Otherwise, and without this setting, signals are taken to keep their values,
+    as in the paper.
     """
 
     threshold: float = 1.0
@@ -71,7 +72,7 @@ class Config:
             expected = "'step', or evaluation 'feasibility'"
             raise InputError(told, path="threshold_over", got="episode", expected=expected)
         if self.map_memory is not None and self.map_memory < 1:
-            told, expected = "the map's memory is out of range", "1 or more steps, or null for ever"
+            told, expected = "the map's memory is out of range", "1 or more steps, or null for no limit"
             raise InputError(told, path="map_memory", got=self.map_memory, expected=expected)
 
 
@@ -136,8 +137,8 @@ class Carry(NamedTuple):
     follow it, one a byte; None if it is not certified. memory: of the session's preference. residuals: what
     the session has seen of its robot (`Seen` in caution/experience.py). threshold_left: what is left of a
     threshold over the episode. learned: what the session has learned of its map (`Taught.to_bytes`). action:
-    the one that was drawn, which the caller may have executed. way: at the step at which a rule begins to
-    hold, motions from there to its horizon that a search found and no policy; one a byte. stuck, here: see
+    the one that was drawn, which the caller may have executed. way: where a rule begins to hold, and a search
+    found a way but no policy did, the motions of that way to the horizon, one a byte. stuck, here: see
     `Taught`.
     """
 
@@ -172,9 +173,9 @@ class Explanation:
 class Decision(NamedTuple):
     """The answer to one step, for A actions. The fields are those of the HTTP contract.
 
-    distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness
-    is rho of the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t). kl:
-    of the answer from the prior [nats]; None if the answer leaves the prior's support or no logits were sent.
+    distribution [A]: pi*. j_values, robustness [A]: None where nothing was evaluated; robustness is rho of
+    the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t). kl: of the
+    answer from the prior [nats]; None if the answer leaves the prior's support or no logits were sent.
     next_poses [A, 3]: where f leads by each action. residual: how far x_t is from the nearest pose that the
     last decision foresaw, in metres and radians; None if there is no such pose. witness: the actions that
     follow `action`, by index; witnesses: the same for every action. warnings: what did not go as it should,
@@ -183,8 +184,8 @@ class Decision(NamedTuple):
     margin [m], slack [steps]: what J asked for at this step. threshold_left: the threshold of the next step,
     as a share of the best chance that it has. map_revision: how often the session's map has changed.
     any_signal: whether every action that J allows has a future that keeps the rule whatever the signals do
-    from here on; None if that was not asked or the rule reads no signals. explanations: one an action, None
-    for an action that is allowed; empty if they were not asked for.
+    from here on; None if that was not asked or the rule reads no signals. explanations [A]: None for an
+    action that is allowed; empty if they were not asked for.
     """
 
     t: int

@@ -230,7 +230,7 @@ def _history(poses: ArrayLike, path: str = "poses") -> Floats:
     array = np.array(poses, dtype=np.float64, order="C")
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not _wrapped(array):
         expected = "a list of finite [x, y, theta]"
-        raise PoseError("not poses", path=path, got=str(poses)[:80], expected=expected)
+        raise PoseError("these are not poses", path=path, got=str(poses)[:80], expected=expected)
     return array
 
 

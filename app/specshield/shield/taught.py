@@ -68,8 +68,8 @@ class Taught(NamedTuple):
     """What a session has learned: its map, and whether its caller executes what is drawn.
 
     contact: whether the last motion ran into something, or went on where f has it stopped. looks: whether
-    `occupied` was sent at this step, be it empty. near [m], [rad]: poses this near may be one, but for noise.
-    These three are not handed on.
+    `occupied` was sent at this step, be it empty. near [m], [rad]: two poses this near to each other may
+    differ by noise alone. These three are not handed on.
 
     stuck: motions that led nowhere, or elsewhere than f has it, and from where. here: the first step at which
     this robot was on this map. `Carry` holds these two beside the bytes.

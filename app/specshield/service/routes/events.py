@@ -90,7 +90,7 @@ async def events(
     Without `after` and `Last-Event-ID` the stream begins with the next decision. With one of them it begins
     after that step, with no decision left out and none sent twice. Steps without a decision have no event.
     The stream ends when the session is finished, when the caller's key is revoked, and when this server
-    stops: then ask again. A caller who reads too slowly is cut off.
+    stops. After a stop, ask again. A caller who reads too slowly is cut off.
     """
     stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)

@@ -24,7 +24,7 @@ class StepRequest(Strict):
         description="The step to decide. A step is decided once: sent again, it returns the stored answer.",
     )
     poses: Poses = Field(
-        description="Poses that end with x_t: the history from any step on up to which the server has it."
+        description="Poses that end with x_t and begin anywhere up to the first one that the server lacks."
     )
     logits: list[float | None] | None = Field(
         None,

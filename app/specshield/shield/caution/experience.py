@@ -46,10 +46,11 @@ class Seen(NamedTuple):
     """What a session remembers of its motions.
 
     moved: how many there were; lost: how many of them were not executed. Both may be fractions. odds: how
-    many times as likely what was seen is if motions never slip as if they do. noisy: how many were compared
-    with f; moves, turns: the sums of their squared residuals [m^2], [rad^2]. exact: how many moves (not turns
-    on the spot) had no residual. standing: the probability, by the last answer, that the robot was not told
-    to move. slipping: the probability that slips alone make the robot stand as often in a row as it has now.
+    likely what was seen is if motions never slip, divided by how likely it is if they do. noisy: how many
+    were compared with f; moves, turns: the sums of their squared residuals [m^2], [rad^2]. exact: how many
+    moves (not turns on the spot) had no residual. standing: the probability, by the last answer, that the
+    robot was not told to move. slipping: the probability that slips alone make the robot stand as often in a
+    row as it has now.
     """
 
     moved: float = 0.0
