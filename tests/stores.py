@@ -147,7 +147,9 @@ def watched(folder: Path) -> Iterator[Watched]:
 
 @contextmanager
 def behind_tls(folder: Path) -> Iterator[str]:
-    """A server that takes TLS alone, with a certificate of a made-up authority; its URL."""
+    """A server that takes TLS alone, with a certificate of a made-up authority, and that refuses commands
+    such as INFO and CONFIG, as a managed one may; its URL.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
@@ -160,8 +162,9 @@ def behind_tls(folder: Path) -> Iterator[str]:
         ("--tls-cert-file", "ca.pem", "--tls-key-file", "key.pem", "--tls-ca-cert-file", "ca.pem"),
     )
     options = ("--port", "0", "--tls-port", str(port), "--tls-auth-clients", "no", *files, *DURABLE)
-    with running(folder, *options):
-        url = f"rediss://127.0.0.1:{port}/0?ssl_ca_certs={folder / 'ca.pem'}"
+    managed = ("--user", "managed", "on", ">secret", "~*", "&*", "+@all", "-@dangerous", "-@admin")
+    with running(folder, *options, *managed):
+        url = f"rediss://managed:secret@127.0.0.1:{port}/0?ssl_ca_certs={folder / 'ca.pem'}"
         node = redis.Redis.from_url(url)
         wait_for(lambda: answers(node))
         yield url

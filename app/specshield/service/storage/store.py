@@ -9,11 +9,12 @@ which the sessions of one owner stand together; it may still name sessions that 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import anyio
+import redis
 
 from specshield.errors import LimitReached, SessionExists
 from specshield.service.access.owners import shown
@@ -211,13 +212,17 @@ class Store:
         three = zip(found[::3], found[1::3], found[2::3], strict=True)
         return [None if state is None else News(state, rows, steps) for steps, rows, state in three]
 
-    async def held_bytes(self) -> int:
-        """The bytes of memory that the store takes; in a cluster all masters together, without replicas."""
+    async def held_bytes(self) -> int | None:
+        """The bytes of memory that the store takes; in a cluster all masters together, without replicas. None
+        where the store does not say: a managed one may refuse the command.
+        """
         async with self._reaching():
-            if not self._in_cluster:
-                return int((await self.redis.info("memory"))["used_memory"])
-            nodes = await self.redis.info("memory", target_nodes="primaries")
-            return sum(int(node["used_memory"]) for node in nodes.values())
+            with suppress(redis.ResponseError):
+                if not self._in_cluster:
+                    return int((await self.redis.info("memory"))["used_memory"])
+                nodes = await self.redis.info("memory", target_nodes="primaries")
+                return sum(int(node["used_memory"]) for node in nodes.values())
+        return None
 
     async def _of_each(self, ids: Sequence[str], command: str, *fields: str) -> list[Any]:
         """The result of this command on each session's hash. One round trip, none without ids."""

@@ -37,10 +37,11 @@ class Gauges:
     async def _families(self) -> list[Metric]:
         sessions, held = await self._store.count(None), await self._store.held_bytes()
         waiting, ended = await anyio.to_thread.run_sync(self._jobs.counts)
+        memory = GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held)
         return [
             _up(1),
             GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions),
-            GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held),
+            *([] if held is None else [memory]),
             _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting),
             _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended),
         ]
