@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from specshield.errors import InputError
+from specshield.errors import InputError, SpecshieldError
 from specshield.service.leaving import ECHO
 from specshield.service.library.files import Kept
 from specshield.service.settings import Settings
@@ -69,6 +69,8 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
     embedded = EmbeddedStore(tmp_path)
     embedded.join()
     shared, other = str(tmp_path / "shared"), str(tmp_path / "other")
+    with pytest.raises(SpecshieldError):  # a first start that could not write its files binds nobody
+        check_files(embedded.url, "/proc", 10.0)
     with ThreadPoolExecutor(8) as servers:  # that all start for the first time
         list(servers.map(lambda _: check_files(embedded.url, shared, 10.0), range(8)))
     check_files(embedded.url, shared, 10.0)

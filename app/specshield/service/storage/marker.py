@@ -33,9 +33,13 @@ def check_files(url: str, place: str, timeout: float) -> None:
     with reaching(), closing(connect(url, blocking=True, socket_timeout=timeout)) as store:
         first = store.set(KEY, mine or made, nx=True)
         theirs = store.get(KEY)
-    if first and mine is None:
-        files.write(FILE, made)
-        return
+        if first and mine is None:
+            try:
+                files.write(FILE, made)
+            except Exception:  # else no server would find its files the right ones, once they can be written
+                store.delete(KEY)
+                raise
+            return
     deadline = time.monotonic() + WAIT
     while mine is None and time.monotonic() < deadline:
         time.sleep(0.1)
