@@ -286,15 +286,27 @@ def test_regions_as_large_as_the_schema_says_are_taken_and_no_larger_ones(client
 
 
 def test_maps_and_policies_that_are_not_there(client, unchanged):
-    for path in ("/v1/maps/none", "/v1/maps/none/image.png", "/v1/policies/none", "/v1/sessions/none", "/v2"):
+    for path in (
+        "/v1/maps/none",
+        "/v1/maps/none/image.png",
+        "/v1/policies/none",
+        "/v1/sessions/none",
+        "/v1/maps/",
+    ):
         problem(client.get(path), 404, "not-found")
     problem(client.get("/v1/maps/..%2f..%2fetc%2fpasswd"), 404, "not-found")
     problem(client.get("/v1/maps/" + "a" * 65), 422, "invalid-input", "map_id")
     problem(client.get("/v1/maps", params={"limit": 0}), 422, "invalid-input", "limit")
-    for path, methods in (("/v1/maps", "GET, POST"), ("/v1/sessions/x", "DELETE, GET"), ("/livez", "GET")):
+    for path, methods in (
+        ("/v1/maps", "GET, POST"),
+        ("/v1/sessions/x", "DELETE, GET"),
+        ("/livez", "GET, HEAD"),
+    ):
         response = client.put(path)
         assert problem(response, 405, "method-not-allowed")["expected"] == methods
         assert response.headers["allow"] == methods
+    for path in ("/livez", "/readyz"):
+        assert client.head(path).status_code == 200
     problem(client.post("/v1/specs/validate", json={"formula": "x > 1", "map_id": "none"}), 404, "not-found")
 
 

@@ -58,6 +58,7 @@ def test_what_a_caller_does_not_take_is_not_what_is_answered(client, begin):
     path = f"/v1/sessions/{begin()['id']}/steps"
     for accept, kind in (
         ("application/msgpack;q=0", "application/json"),
+        ("application/msgpackfoo", "application/json"),
         ("application/msgpack; q=0.0, application/json", "application/json"),
         ("*/*", "application/json"),
         ("application/msgpack;q=0.5", "application/msgpack"),

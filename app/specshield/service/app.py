@@ -90,6 +90,7 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         servers=[{"url": "."}],
         lifespan=lambda app: _life(app, settings, embedded),
         redoc_url=None,
+        redirect_slashes=False,  # behind a proxy's path prefix a redirect would lead astray
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
     )

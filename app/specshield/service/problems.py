@@ -241,7 +241,9 @@ def _held(value: Any, part: str | int) -> Any:
 
 def _allowed(request: Request) -> str:
     """All methods of a path, which may have several routes."""
-    asked = [{**request.scope, "method": method} for method in ("DELETE", "GET", "PATCH", "POST", "PUT")]
+    asked = [
+        {**request.scope, "method": method} for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
+    ]
     routes = request.app.routes
     return ", ".join(one["method"] for one in asked if any(r.matches(one)[0] is Match.FULL for r in routes))
 

@@ -30,7 +30,10 @@ def read_step(body: bytes | str, packed: bool) -> StepBody:
 
 def accepts(header: str, kind: str) -> bool:
     """Whether the header Accept names this media type, and does not refuse it by q=0."""
-    return re.search(rf"{kind}(?!\s*;\s*q=0(\.0*)?\s*(,|$))", header, re.IGNORECASE) is not None
+    return (
+        re.search(rf"(?<![^\s,]){kind}(?![^\s;,]|\s*;\s*q=0(\.0*)?\s*(,|$))", header, re.IGNORECASE)
+        is not None
+    )
 
 
 def write_problem(error: SpecshieldError, packed: bool) -> bytes:

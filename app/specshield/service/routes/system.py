@@ -12,12 +12,14 @@ from specshield.service.state import ServerState, problems
 router = APIRouter(tags=["system"])
 
 
+@router.head("/livez", include_in_schema=False)  # monitors ask so
 @router.get("/livez", summary="Is it alive?")
 async def livez() -> Health:
     """Answers as long as the process runs. It looks neither at the store nor at the kernels."""
     return Health(status="ok")
 
 
+@router.head("/readyz", include_in_schema=False)
 @router.get(
     "/readyz",
     summary="Is it ready?",
