@@ -329,6 +329,19 @@ def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_ha
     assert poses[20] == poses[stays]
 
 
+@pytest.mark.parametrize("gap", [5e-7, 0.004])
+def test_a_robot_that_can_come_no_nearer_stands_and_does_not_push_what_is_seen(gap):
+    """A wall right across the room, just ahead, and no time left to wait for a way: at step 0 and later."""
+    wall = [(2.425, y) for y in np.arange(0.025, 2.0, 0.05)]
+    pose = (2.4 - STRETCH.radius - STRETCH.offset[0] - gap, 1.0, 0.0)
+    for shield in (shield_of(2, learn_map=True), shield_of(2, learn_map=True, uncertainty=Uncertainty())):
+        decision = decide(shield, [pose], None, True, occupied=wall)
+        assert (decision.mode, decision.reason) == ("fallback", "infeasible")
+        again = decide(shield, [pose, pose], None, True, carry=decision.carry, occupied=wall)
+        for action in (decision.action, again.action):
+            assert int(STRETCH.motion_of[action]) == STRETCH.wait_motion
+
+
 @pytest.mark.parametrize("skin", [0.0, 0.02])
 def test_a_robot_whose_scanner_sees_its_own_body_all_round_is_not_shut_in(skin):
     """Points on the footprint's edge, or a little outside: they lie under no more than 3 cm of it."""

@@ -108,16 +108,15 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and _loses(shield, judged.part, tried, awaited) == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
-    elif not helps:  # contacts may be the reason
-        known, marked = taught.map, taught.map.occupied & (taught.map.by != SENT)
-        believed = marked.any() or len(taught.barred) > 0
-        free = on_map(told, revised(known, forget(known, marked))) if believed else shield
-        asked = [adapted(each, "briefly") if believed else each for each in free.proposers]
-        ways = futures(now.prefix, free.body, asked, None, (0.0,))
-        first, _, said, helps = most_kept(free, judged.part, ways)
-        first = first if helps else ways.preferred
-        if believed:
+    elif not helps:
+        known, marked, ways = taught.map, taught.map.occupied & (taught.map.by != SENT), judged.tried
+        if marked.any() or len(taught.barred):  # contacts may be the reason
+            free = on_map(told, revised(known, forget(known, marked)))
+            asked = [adapted(each, "briefly") for each in free.proposers]
+            ways = futures(now.prefix, free.body, asked, None, (0.0,))
+            first, _, said, helps = most_kept(free, judged.part, ways)
             said = ("what contacts taught leaves no way, so it is ignored for this action", *said)
+        first = first if helps else ways.preferred
     tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # only the futures that were judged
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 

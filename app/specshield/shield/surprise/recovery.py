@@ -15,6 +15,8 @@ from specshield.shield.decision import Config, Shield
 from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts, verdict
 
+BETTER = 0.01  # [m] what brings the robot nearer by less may be a push against an obstacle; chosen by hand
+
 
 def recovers(config: Config) -> bool:
     """Whether a session expects that robot or map are not as told. Other sessions do as the paper says."""
@@ -45,7 +47,8 @@ def most_kept(
         said.append(f"no way that was tried keeps {part}: the best misses it by {abs(rho[left].max()):.3g}")
     nearest = np.where(left, nearest, -np.inf)
     best = int(np.argmax(nearest[:-1]))
-    return int(tried.motions[best, 0]), tuple(lost), tuple(said), bool(nearest[best] > nearest[-1])
+    better = bool(nearest[best] > nearest[-1] + BETTER)
+    return int(tried.motions[best, 0]), tuple(lost), tuple(said), better
 
 
 def given_up(prefix: Prefix) -> tuple[str, ...]:
