@@ -62,7 +62,7 @@ def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
     for name, value in signals.items():
         where = f"signals.{name}"
         if name not in names:
-            declared = f"one of {sorted(names)}, which the session's rules read"
+            declared = f"one of {', '.join(sorted(names))}, which the session's rules read"
             expected = declared if names else "no signals: the rule reads none"
             raise SampleError(f"unknown signal {name!r}", path=where, got=name, expected=expected)
         if not -LARGEST <= value <= LARGEST:

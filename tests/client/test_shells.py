@@ -124,6 +124,11 @@ def test_a_closed_port_is_a_transport_error(use):
         use(url, validate)
 
 
+def test_a_server_without_tls_is_told(use, server):
+    with pytest.raises(errors.TransportError, match=r"http:// in place of https:// for a server without TLS"):
+        use(server.url.replace("http://", "https://"), validate, timeout=60.0)
+
+
 @pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_host_that_no_name_can_be_is_a_transport_error(use):
     with pytest.raises(errors.TransportError):

@@ -196,9 +196,11 @@ def test_content_is_bytes_a_text_or_a_file(tmp_path: Path):
         == wire.content("resolution: 0.05", "metadata")
         == wire.content(b"resolution: 0.05", "metadata")
     )
-    with pytest.raises(errors.InputError, match=r"none\.pgm") as caught:
-        wire.content(tmp_path / "none.pgm", "image")
-    assert caught.value.path == "image"
+    for wrong in (tmp_path / "none.pgm", "flat.pgm"):  # a text is content, so a file's name is none
+        with pytest.raises(errors.InputError, match=r"\.pgm") as caught:
+            wire.content(wrong, "image")
+        assert caught.value.path == "image"
+    assert wire.content("flat.pgm", "name") == b"flat.pgm"
 
 
 def test_an_id_cannot_leave_its_place_in_the_path():

@@ -64,8 +64,9 @@ def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
     )
 
 
-def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
-    (tmp_path / "flat.json").write_text('{"rooms?": []}')
+@pytest.mark.parametrize("content", ['{"rooms?": []}', '{"rooms": {"Hall": {}}, "regions": {}}'])
+def test_a_file_that_is_no_map_is_told_in_one_line(content, tmp_path):
+    (tmp_path / "flat.json").write_text(content)
     refused = run_specshield(
         "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--out", tmp_path
     )  # fmt: skip
@@ -158,6 +159,12 @@ def test_a_wrong_argument_is_told_before_a_server_is_started(asked, said, tmp_pa
     (line,) = refused.stderr.strip().splitlines()
     assert line.startswith(said)
     assert not (tmp_path / "data").exists()
+
+
+def test_a_policy_that_is_not_there_is_told_with_those_that_are(tmp_path):
+    refused = run_specshield("run", "flat", "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert refused.returncode == 1
+    assert "expected one of case1, case1-dqn, case2, case2-dqn, or the id" in refused.stderr
 
 
 @pytest.mark.parametrize("asked", [("run", "case1"), ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")])

@@ -186,5 +186,5 @@ def test_a_model_may_answer_with_whatever_a_session_takes_for_logits() -> None:
     )
     assert env.reset()[1]["distribution"][0] == 0.0
     env.step(1)
-    with pytest.raises(LogitsError, match="these are not numbers; got 'None'"):
+    with pytest.raises(LogitsError, match="this is no list of numbers; got 'None'"):
         env.step(1)

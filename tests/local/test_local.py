@@ -460,7 +460,7 @@ def test_what_is_wrong_is_said() -> None:
         LocalShield.shipped("case9")
     shield = LocalShield.shipped("case1")
     session = shield.session(initial_pose=START)
-    with pytest.raises(HistoryConflict):
+    with pytest.raises(HistoryConflict, match="another pose for step 0 already, its initial_pose"):
         session.step((4.0, 5.0, 0.0), np.zeros(20))
     session.step((*START[:2], 2 * np.pi), np.zeros(20))
     wall = OccupancyGrid(np.repeat([[0, 0, 0, 1, 0, 0, 0]], 7, axis=0) > 0, 1.0)

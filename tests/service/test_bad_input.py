@@ -96,6 +96,27 @@ def test_fields_of_a_specification(client, unchanged, body, path):
 
 
 @pytest.mark.parametrize(
+    ("region", "missing"),
+    [({"center": [0, 0], "radius": 1}, "type"), ({"type": "circle", "center": [0, 0]}, "radius")],
+)
+def test_what_a_region_lacks_is_said_to_be_missing(client, region, missing):
+    told = client.post("/v1/specs/validate", json={"formula": "F[0,3] A", "regions": {"A": region}})
+    path = f"regions.A.{missing}"
+    assert problem(told, 422, "invalid-input", path)["detail"] == f"{path} is missing"
+
+
+def test_a_body_that_is_no_json_is_told_with_the_place_of_the_fault(client):
+    said = {"Content-Type": "application/json"}
+    told = client.post("/v1/sessions", content=b"{'policy_id': 'case1'}", headers=said)
+    assert problem(told, 422, "invalid-input")["detail"].endswith("at character 1")
+
+
+def test_an_address_with_the_version_twice_is_told(client):
+    told = problem(client.post("/v1/v1/sessions", json={}), 404, "not-found")
+    assert told["expected"] == "a path listed at /docs; the base_url of the SDK ends before /v1"
+
+
+@pytest.mark.parametrize(
     "content", [b"{", b"[1, 2]", b'"text"', b"", b"\xff\xfe", b"[" * 100_000, b'{"formula": 1e999}']
 )
 def test_bodies_that_are_no_json_object(client, unchanged, content):

@@ -240,7 +240,7 @@ def test_another_robot_with_other_signals_and_back(server, client, begin, step, 
         pose = answer.json()["next_poses"][0]
     problem(step(session, 6, [pose], logits=LOGITS), 422, "invalid-logits")
     unknown = step(session, 6, [pose], logits=[0.0, None, 1.0], signals={"charge": 1.0})
-    assert "['alarm', 'battery']" in problem(unknown, 422, "invalid-samples")["expected"]
+    assert "one of alarm, battery," in problem(unknown, 422, "invalid-samples")["expected"]
     shown = switch(session, 6, LATER, clock="restart").json()
     assert shown["max_steps"] == 600
     assert step(session, 6, [pose], logits=LOGITS).json()["action_name"] in session["actions"]

@@ -191,7 +191,7 @@ class SessionState:
                 self._unanswered = asked
             taken = is_taken(error, self.t)
             if taken and raises:
-                instead = "session.record(pose) passes this one over"
+                instead = "or session.record(pose), to go on without a decision for this step"
                 error.expected = f"{error.expected or 'a later step'}; {instead}"
             if raises or not taken or asked != self.t or x_t is None:
                 raise

@@ -46,6 +46,7 @@ TRIES = 6
 FARTHEST = 1e8  # [m], [rad]; a server takes no larger numbers in poses and points
 LONGEST = 1e6  # [s]; a socket takes no timeout of more than 2**31 ms
 Content = bytes | str | os.PathLike[str]
+FILES = (".json", ".pgm", ".png", ".safetensors", ".yaml", ".yml")  # how the name of a file ends
 
 
 class Request(NamedTuple):
@@ -142,13 +143,18 @@ _json = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=_listed
 
 
 def content(source: Content, where: str) -> bytes:
-    """The bytes of a file (a path object) or a text, or the given bytes. Raises InputError."""
+    """The bytes of a file (a path object) or a text, or the given bytes. Raises InputError, also for a text
+    that is the name of a file.
+    """
     if isinstance(source, os.PathLike):
         try:
             return Path(source).read_bytes()
         except OSError as error:
             told, expected = f"{where} cannot be read: {error.strerror}", "a file that can be read"
             raise InputError(told, path=where, got=str(source), expected=expected) from error
+    if isinstance(source, str) and where != "name" and source.endswith(FILES):
+        told, expected = "this text is the name of a file, not its content", f"pathlib.Path({source!r})"
+        raise InputError(told, path=where, got=source, expected=expected)
     return source.encode() if isinstance(source, str) else source
 
 
@@ -179,7 +185,7 @@ def _finite(
 
 def logit_values(logits: Logits) -> list[float | None]:
     """One logit for each action; minus infinity becomes None. Raises LogitsError for NaN and +infinity."""
-    values = _floats(logits, LogitsError, "logits", "one number an action")
+    values = _floats(logits, LogitsError, "logits", "one number for each action")
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
             where, expected = f"logits[{i}]", "a finite number, -inf or None"
@@ -238,7 +244,8 @@ def _floats(values: Any, error: type[InputError], where: str, expected: str) -> 
         return [-math.inf if value is None and error is LogitsError else float(value) for value in listed]
     except (TypeError, ValueError, OverflowError, RuntimeError) as cause:  # the last: tensors without values
         nested = isinstance(listed, list | tuple) and any(isinstance(value, list | tuple) for value in listed)
-        told = "these are lists of numbers, as of a batch" if nested else "these are not numbers"
+        told = "these are not numbers" if isinstance(listed, list | tuple) else "this is no list of numbers"
+        told = "these are lists of numbers, as of a batch" if nested else told
         raise error(told, path=where, got=f"{listed!r:.80}", expected=expected) from cause
 
 

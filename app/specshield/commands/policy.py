@@ -95,7 +95,7 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
             told = f"{path} names the image {content['image']!r}, which is not beside it"
             raise InputError(told, path="--map", expected="the map's PGM or PNG beside its YAML")
         return lambda client: client.maps.upload(path, image)
-    if "rooms" in content:
+    if isinstance(content.get("rooms"), list):
         sizes = {} if assets is None else _read(assets, "--assets")
         return lambda client: client.maps.procthor(content, sizes)
     if "info" in content:
@@ -121,8 +121,9 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        drawn = "; of a map drawn as an image, the YAML beside it" if option == "--map" else ""
-        expected = f"a JSON or YAML file{drawn}"
+        expected = "a JSON or YAML file"
+        if option == "--map":
+            expected += "; of a map drawn as an image, the YAML beside it; or the name of a map on the server"
         raise InputError(f"{path} cannot be read: {reason}", path=option, expected=expected) from None
     try:
         document = text.rstrip().removesuffix("\n---")  # `ros2 topic echo` ends a message with that

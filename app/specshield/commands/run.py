@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from specshield.errors import InputError
+from specshield.errors import InputError, NotFound
 
 if TYPE_CHECKING:  # every command imports this module
     from specshield.sim.cases import Case
@@ -36,7 +36,12 @@ def run_policy(
     place = None if target is None else _target(target)
     status = StatusLine()
     with client_of(None, status) as client:
-        found = client.policies.get(policy)
+        try:
+            found = client.policies.get(policy)
+        except NotFound as error:
+            names = ", ".join(each.name for each in client.policies.list() if each.name)
+            error.expected = f"one of {names}, or the id of another policy in SPECSHIELD_DATA_DIR"
+            raise
         case = _case(found.id, found.name or found.id[:12], place, seed)
         session, start, refused = begin(client, case, found.id, seed, shaping=shaping)
         status.say("driving ...")

@@ -269,7 +269,8 @@ class LocalSession:
         told = self._given.get(self.t, x_t)
         gap = [a - b for a, b in zip(x_t, told, strict=True)]
         if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > SAME_POSE:
-            conflict = f"the pose of step {self.t} is not the one that was given before"
+            begins = ", its initial_pose" if self.t == 0 else ""
+            conflict = f"the session has another pose for step {self.t} already{begins}"
             raise HistoryConflict(conflict, path="pose", got=list(x_t), expected=f"{list(told)}")
         return told
 

@@ -112,7 +112,7 @@ def robot_from_json(spec: Any) -> Robot:
     """
     if isinstance(spec, str):
         if spec not in PRESETS:
-            known = f"one of {', '.join(sorted(PRESETS))}; or an object"
+            known = f"one of {', '.join(sorted(PRESETS))}; or an object with footprint and actions"
             raise _wrong(f"unknown robot {spec!r}", None, spec, known)
         return PRESETS[spec]
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})

@@ -155,8 +155,10 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     """
     if found[0]["type"] == "json_invalid":
         reason = found[0].get("ctx", {}).get("error", "")
-        what = below or "the body"
-        return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
+        where = found[0]["loc"][-1:]  # FastAPI says at which character; pydantic's reason says at which line
+        at = f" at character {where[0]}" if where and isinstance(where[0], int) else ""
+        told = f"{below or 'the body'} is not JSON: {reason}{at}"
+        return InputError(told, path=below or None, expected="a JSON object")
     if isinstance(body, bytes):  # FastAPI has not read it
         told, expected = "the body is not declared as JSON", "the header Content-Type: application/json"
         return errors.UnsupportedMediaType(told, path="Content-Type", expected=expected)
@@ -176,7 +178,10 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     first = listed[0]
     parts = re.split(r"[.\[]", first["path"])
     kind = next((FIELD_ERRORS[part] for part in parts if part in FIELD_ERRORS), InputError)
-    wrong = {"missing": "is missing", "extra_forbidden": "is not a field of this request"}
+    wrong = {
+        **dict.fromkeys(("missing", "union_tag_not_found"), "is missing"),
+        "extra_forbidden": "is not a field of this request",
+    }
     message = f"{first['path'] or 'the body'} {wrong.get(found[0]['type'], 'is not valid')}"
     ways = dict.fromkeys(each["expected"] for each in listed if each["path"] == first["path"])
     expected = " or ".join(ways)
@@ -199,8 +204,8 @@ def valid(item: Mapping[str, Any]) -> str:
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
         "string_pattern_mismatch": "a text of the form {pattern}",
-        "too_short": "at least {min_length} of them",
-        "too_long": "at most {max_length} of them",
+        "too_short": "at least {min_length} items",
+        "too_long": "at most {max_length} items",
     }
     if item["type"] == "finite_number" and "logits" in item["loc"]:
         return "a finite number, or null for minus infinity"
@@ -265,6 +270,8 @@ def install(app: FastAPI) -> None:
         path = request.url.path
         if error.status_code == 404:
             told, expected = f"there is no {path} here", "a path listed at /docs"
+            if path.startswith("/v1/v1/"):
+                expected += "; the base_url of the SDK ends before /v1"
             return ProblemResponse(errors.NotFound(told, got=path, expected=expected))
         if error.status_code == 405:
             told, allowed = f"{path} does not take {request.method}", _allowed(request)

@@ -122,9 +122,10 @@ class Exchange:
         if isinstance(error, httpx.TimeoutException):
             mapped = TransportTimeout(f"no answer within {max(self.seconds, 0.0):.3g} s: {what}")
         else:
+            plain = "; http:// in place of https:// for a server without TLS" if "[SSL" in str(error) else ""
             mapped = TransportError(
                 f"the server cannot be reached: {str(error) or type(error).__name__}: {what}",
-                expected="a specshield server that runs at this address",
+                expected=f"a specshield server that runs at this address{plain}",
             )
         mapped.__cause__ = error
         return Failure(mapped, *self._taken())

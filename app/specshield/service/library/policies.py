@@ -118,7 +118,8 @@ class Policies(Claimed):
 
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
-            told, expected = f"policy {record.id} is not ready", "a policy whose status is `ready`"
+            told = f"policy {record.id} is not ready"
+            expected = "a policy whose status is `ready`: wait for it"
             raise PolicyError(told, path="policy_id", got=record.id, expected=expected)
         task = self.task(record.about)
         if record.name is not None:

@@ -38,8 +38,9 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
     differs = np.flatnonzero(np.any(~agree(stored[first : first + overlap], poses[:overlap]), axis=1))
     if len(differs):
         row = int(differs[0])
+        begins = ", its initial_pose" if first + row == 0 else ""
         raise HistoryConflict(
-            f"the pose of step {first + row} is not the one stored",
+            f"the session has another pose for step {first + row} already{begins}",
             path=f"poses[{row}]",
             got=poses[row].tolist(),
             expected=f"{stored[first + row].tolist()} within {TOLERANCE:g}",

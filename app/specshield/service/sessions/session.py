@@ -134,7 +134,7 @@ class Session(NamedTuple):
             and _equal(asked.free, before.free)
         ):
             t, ahead = request.t, self.state.next_t
-            told = f"step {t} was decided for another x_t, logits, signals, main_task_done, occupied or free"
+            told = f"step {t} was decided for another pose, logits, signals, main_task_done, occupied or free"
             expected = f"the same request again, or step {ahead}"
             raise StepConflict(told, path="t", got=t, expected=expected, expected_t=ahead)
         history.join(self.poses, request.t, np.array(request.poses))
