@@ -28,7 +28,7 @@ from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map, wary
 from specshield.shield.uncertainty import Care, Uncertainty
 from specshield.task import make_task
-from specshield.world.learned import CONTACT, SENT, LearnedMap, learn
+from specshield.world.learned import CONTACT, SENT, LearnedMap, applied, learn
 from specshield.world.occupancy import OccupancyGrid
 from tests.made import synthesise
 
@@ -401,11 +401,16 @@ def test_a_robot_of_small_motions_keeps_more_time_for_a_way_around():
     assert [steps(0.1, 30), steps(0.1, 15), steps(0.1, 45)] == [30, 40, 27]
 
 
-@pytest.mark.parametrize(("learn_map", "later"), [(False, []), (True, None), (True, [])])
+@pytest.mark.parametrize(
+    ("learn_map", "later", "tables"),
+    [(False, [], False), (True, None, False), (True, [], False), (True, [], True)],
+)
 def test_what_was_seen_once_in_the_only_way_is_doubted_after_20_steps_in_which_a_sensor_saw_nothing_there(
-    learn_map, later
+    learn_map, later, tables
 ):
-    """The wall with one gap again, which one wrong measurement shuts at step 0."""
+    """The wall with one gap again, which one wrong measurement shuts at step 0. tables: whether tables are
+    made for the map on which it is shut, as a server does beside the decisions.
+    """
     doubts = learn_map and later is not None
     walls = np.zeros((40, 80), bool)
     walls[19:21, :56] = True
@@ -419,6 +424,9 @@ def test_what_was_seen_once_in_the_only_way_is_doubted_after_20_steps_in_which_a
         carry = decision.carry
         if decision.spec_status != "pending":
             break
+        if tables and t == 0:
+            shut = applied(task.grid, Taught.from_bytes(carry.learned).map)
+            shield = replace(shield, proposers=tuple(each.remade(shut) for each in shield.proposers))
         modes.append(decision.mode)
         said.append(decision.warnings)
         poses.append(step(shield.body, *poses[-1], int(STRETCH.motion_of[decision.action])))

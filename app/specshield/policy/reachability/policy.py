@@ -74,18 +74,21 @@ class ReachabilityPolicy(Carded):
     early: int = 0  # [steps] see `hurried`
     wanted: Bools | None = None  # [M] the first motions after which to propose ways; None: all of them
     brief: bool = False  # whether it looks only for its preferred way, by a short search
+    again: ReachabilityPolicy | None = None  # the same with tables for another map, see `remade`
 
     @cached_property
     def _rules(self) -> Rules:
         return make_rules(self.task)
 
     def on_body(self, body: Body, guess: bool = False) -> ReachabilityPolicy:
-        """The policy on another map: its tables stay the same, its ways are simulated on that map.
+        """The policy on another map, on which its ways are simulated: with the newest tables that there are.
 
         guess: whether the map is one of several that are tried in one decision. If a short search for a way
-        around gives up on such a map, nothing else is tried.
+        around gives up on such a map, nothing else is tried. A guess has fewer obstacles than what was
+        learned, for which the newest tables are, so it has the tables of the policy's own map.
         """
-        return self._but(body, told=False, guess=guess)
+        policy = self if guess or self.again is None else self.again
+        return policy._but(body, told=False, guess=guess)
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
         """The policy without barred motions [n, 6] (robot/barred.py)."""
@@ -154,9 +157,10 @@ class ReachabilityPolicy(Carded):
         return np.asarray((highest - 1.0) / STEP_CODES, np.float64)
 
     def remade(self, grid: OccupancyGrid) -> ReachabilityPolicy:
-        """The policy with tables for another map of the same size."""
+        """The policy, which has tables for another map of the same size beside its own from now on."""
         made = synthesise(replace(self.task, grid=grid), self.settings)
-        return replace(self, tables=made.tables, narrow=made.narrow, wide=made.wide)
+        again = replace(self, tables=made.tables, narrow=made.narrow, wide=made.wide, again=None)
+        return replace(self, again=again)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
