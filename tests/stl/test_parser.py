@@ -199,6 +199,8 @@ def test_names_are_free_unless_given() -> None:
     assert parse("a and Bedroom_2", names=["a", "Bedroom_2"]).names == ("Bedroom_2", "a")
     with pytest.raises(FormulaError, match="nothing declares 'a'"):
         parse("a", names=[])
+    with pytest.raises(FormulaError, match="expected one of b, or a signal that `signals` declares"):
+        parse("a", names=["b"])
 
 
 def test_a_horizon_over_the_limit() -> None:

@@ -195,7 +195,8 @@ class _Parser:
         if self._names is not None and token.text not in self._names:
             known = sorted(name for name in self._names if "(" not in name)
             more = f" and {len(known) - 20} more" if len(known) > 20 else ""
-            expected = f"one of {', '.join(known[:20])}{more}" if known else "no names at all"
+            declared = f"one of {', '.join(known[:20])}{more}, or a signal that `signals` declares"
+            expected = declared if known else "no names at all"
             expected += _hint(token, self._token)
             raise self._error(f"nothing declares '{_clip(token.text)}'", token, expected)
         return Name(token.text)
