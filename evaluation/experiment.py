@@ -140,7 +140,7 @@ class Setting:
         """The paper's shield. Raises NotFound where there is no DQN for the case."""
         if self.learned is None:
             raise NotFound(
-                f"there is no learned policy for {self.case.name}", path="--methods", got="paper",
+                f"there is no learned policy for {self.case.name}", path="methods", got="paper",
                 expected="a case with a folder in models/, or other methods",
             )  # fmt: skip
         return make_shield([replace(self.learned, literal=True)])
@@ -222,7 +222,7 @@ def split(method: str) -> tuple[str, Config]:
     kind, at, asked = method.partition("@")
     if kind not in METHODS:
         told = f"there is no method {kind!r}"
-        raise NotFound(told, path="--methods", got=method, expected=f"{', '.join(METHODS)}; or {FORMS}")
+        raise NotFound(told, path="methods", got=method, expected=f"{', '.join(METHODS)}; or {FORMS}")
     if not at:
         return kind, Config()
     metres, _, steps = asked.partition("/")
@@ -237,7 +237,7 @@ def split(method: str) -> tuple[str, Config]:
         margin, slack = math.nan, 0
     if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
-            "after the @ there is no setting of this method", path="--methods", got=method, expected=FORMS
+            "after the @ there is no setting of this method", path="methods", got=method, expected=FORMS
         )
     return kind, Config(margin=margin, slack=slack)
 

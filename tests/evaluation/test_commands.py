@@ -94,6 +94,8 @@ def test_report_writes_a_page_and_its_pictures(tmp_path):
     ("arguments", "said"),
     [
         (["--case", "case9"], "one of case1, case2"),
+        (["--case", "1", "--methods", "ours,nope"], "adaptive, lookahead; or NAME@METRES, "),
+        (["--case", "1", "--methods", "ours@nope"], "NAME@step/SHARE or NAME@robustness/METRES, with NAME"),
         (["--case", "house"], "--house drawn_0 with --case house"),
         (["--case", "house", "--house", "house_0"], 'prior.load_dataset("procthor-10k")'),
         (
@@ -137,13 +139,10 @@ def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
         ("results", "--only", "nope"),
         ("curves", "--metres", "0.1,nope"),
         ("rewards", "--reward", "paper,nope"),
-        ("evaluate", "--methods", "ours,nope"),
-        ("evaluate", "--methods", "ours@nope"),
     ],
 )
 def test_a_name_that_nothing_has_is_refused(command, option, given, tmp_path):
-    case = ("--case", "1") if command == "evaluate" else ()
-    refused = specshield(command, *case, option, given, "--out", str(tmp_path), code=1)
+    refused = specshield(command, option, given, "--out", str(tmp_path), code=1)
     (line,) = refused.stderr.splitlines()
     assert line.startswith(f"{option}: ")
     assert "nope" in line

@@ -345,6 +345,8 @@ def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
         whole = Entry.of("@old", "00000001,0,06a000000")  # as older versions name a file
         assert whole is not None
         assert whole.expires == 0x6A000000
+        entry, _ = archive.put("@new", time.time(), dump)
+        assert entry.until == f"{int(entry.until, 16):09x}"  # by this form they find the files of this one
 
     run(url, archive, story)
 

@@ -175,7 +175,7 @@ def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, c
     os.kill(run, signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed")
     assert "signal 9" in read(client, policy)["error"]
-    assert ask(client, **LATER, seed=2)["status"] == "queued"
+    assert ask(client, **LATER, seed=2)["status"] in ("queued", "training")  # if the worker is quick
     client.delete(f"/v1/policies/{policy['id']}")
 
 

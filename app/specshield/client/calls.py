@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -25,7 +26,9 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     This also waits for a server that cannot be reached yet. Raises TransportTimeout after `timeout` [s], with
     the progress of the server's start.
     """
-    seconds, timeout = 0.0, wire.seconds_value(timeout, "timeout")
+    if timeout not in (0.0, math.inf):  # to ask once, or for ever
+        wire.seconds_value(timeout, "timeout")
+    seconds = 0.0
     while True:
         outcome = yield Request("GET", "/readyz")
         seconds += outcome.seconds

@@ -4,9 +4,9 @@
 
 A session's key is `owner@id`, as in the store. `changes` is the number of writes to the session, and
 `beginning` differs for two sessions of one id. So a file never changes, and a late writer never replaces a
-newer file. `expires` is nine hexadecimal digits of seconds since 1970 and three of their fraction; older
-versions rounded it up. A file has a head (config, state) and a body (rows, steps), each packed with msgpack
-and compressed with zstandard. All calls block.
+newer file. `expires` is in 1 / 4096 s since 1970, in hexadecimal. Older versions wrote whole seconds, in nine
+digits; they read the files of this one, which to them never expire. A file has a head (config, state) and a
+body (rows, steps), each packed with msgpack and compressed with zstandard. All calls block.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Entry:
     @property
     def expires(self) -> float:
         """When it is erased [s since 1970]."""
-        return int(self.until, 16) / 16.0 ** (len(self.until) - 9)
+        return int(self.until, 16) / (1 if len(self.until) == 9 else 16**3)
 
     @property
     def path(self) -> str:
@@ -71,7 +71,7 @@ class Archive:
         number of bytes that were written: 0 if the file existed already.
         """
         beginning, _, changes = dump.version.decode().partition(":")
-        entry, content = Entry(key, int(changes), beginning, f"{int(expires * 16**3):012x}"), pack(dump)
+        entry, content = Entry(key, int(changes), beginning, f"{int(expires * 16**3):x}"), pack(dump)
         if self._objects.read(entry.path) == content:
             return entry, 0
         self._objects.write(entry.path, content)
