@@ -111,6 +111,13 @@ Content-Length: {len(body)}
             answer = HTTPResponse(connection)
             answer.begin()
             assert (answer.status, json.loads(answer.read())["horizon"]) == (200, 3)
+        twice = head.replace(b"Upgrade: h2c", b"Upgrade: h2c\r\nConnection: keep-alive")
+        connection.sendall(head + body + twice + body + head + body)
+        answered = b""
+        while (count := answered.count(b'"horizon":3')) < 3:
+            answered += (got := connection.recv(1 << 16))
+            assert got, answered
+        assert count == answered.count(b"HTTP/1.1 200 ") == 3
 
 
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:

@@ -85,8 +85,11 @@ class BoundedProtocol(HttpToolsProtocol):
             if self._head > self._most:
                 self._refuse_head()
                 return
-        self._data = data
-        super().data_received(data)
+        self._left: list[bytes | memoryview] = [data]
+        while self._left and not self.transport.is_closing():
+            self._fed = self._left.pop()
+            super().data_received(self._fed)  # type: ignore[arg-type]
+        self._fed = b""  # keeps nothing of a body for as long as the connection idles
         idle = self.cycle is None or self.cycle.response_complete
         if self._late is None and (self._in_head or idle) and not self._upgraded:
             self._expect_head()
@@ -103,7 +106,8 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_headers_complete(self) -> None:
         self._in_head = False
-        self._again = self.parser.should_upgrade() and self._get_upgrade() not in (None, b"websocket")
+        asks = self.parser.should_upgrade() and any(name == b"upgrade" for name, _ in self.headers)
+        self._again = asks and not self._should_upgrade()
         if self._again:
             return
         self._stop_waiting()
@@ -123,11 +127,11 @@ class BoundedProtocol(HttpToolsProtocol):
             return
         version, method = self.parser.get_http_version().encode(), self.parser.get_method()
         lines = [name + b": " + value for name, value in self.headers if name != b"upgrade"]
-        read = sys.exc_info()[1]
-        rest = self._data[read.args[0] :] if read is not None else b""
-        self.parser = httptools.HttpRequestParser(self)
         head = b"\r\n".join([method + b" " + self.url + b" HTTP/" + version, *lines, b"", b""])
-        super().data_received(head + rest)
+        read = cast(httptools.HttpParserUpgrade, sys.exc_info()[1]).args[0]
+        self.parser = httptools.HttpRequestParser(self)
+        self.parser.set_dangerous_leniencies(lenient_data_after_close=True)  # as uvicorn's parser
+        self._left += [memoryview(self._fed)[read:], head]  # `data_received` takes the last one first
 
     def handle_websocket_upgrade(self) -> None:
         self._upgraded = True
