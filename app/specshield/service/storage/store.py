@@ -8,6 +8,7 @@ which the sessions of one owner stand together; it may still name sessions that 
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -28,6 +29,12 @@ INDEX = "specshield:sessions"
 Limit = tuple[str | None, int]  # the most sessions that an owner may have, or for None all owners together
 NO_VERSION = b"-"  # a version that no session has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
+# On Redis from 7.2 on, and on Valkey, WAIT waits only for what its own caller wrote: hence the SET. A store
+# whose memory is full takes it after a PERSIST.
+FOLLOW = Script("""\
+redis.call('PERSIST', KEYS[1])
+redis.call('SET', KEYS[1], '', 'EX', 60)
+return ''""")
 # A script, since a store whose memory is full refuses all commands of a transaction, also those that read.
 DUMP = """\
 return {redis.call('HMGET', KEYS[1], 'config', 'state', 'version'), redis.call('GET', KEYS[2]),
@@ -111,7 +118,8 @@ class Store:
         """Returns once as many replicas as were asked for have all that was written before."""
         if self._replicas:
             async with self._reaching():
-                await self._wire.follow()
+                keys = await self._wire.of_each("specshield:follow")
+                await asyncio.gather(*(self._wire.run(FOLLOW, [key], ()) for key in keys))
 
     async def create(self, id: str, config: bytes, change: Change, *limits: Limit) -> bytes:
         """Creates a session and returns its first version. Raises SessionExists and LimitReached. `config`
@@ -163,7 +171,7 @@ class Store:
         """
         field = "" if change.t is None else change.t
         args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
-        args.append(self._ttl * 1000)
+        args += (self._ttl * 1000, int(self._replicas > 0))
         with reaching():
             written = await self._wire.run(APPEND, keys(id), args)
         if isinstance(written, bytes):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import count
 from typing import Any
 
 import anyio
 import redis.asyncio
 from redis.backoff import NoBackoff
+from redis.crc import key_slot
 
 from specshield.service.storage.wire import PART, Script, Wire, too_few
 
@@ -35,9 +37,19 @@ class Wires:
             self._look_again()
             raise
 
-    async def follow(self) -> None:
-        """As `Wire.follow`, for all masters: what was written may lie on any of them."""
-        await asyncio.gather(*(self._to(node).follow() for node in self._cluster.get_primaries()))
+    async def of_each(self, name: str) -> list[str]:
+        """As `Wire.of_each`: a key for each master that has slots."""
+        if not self._cluster.get_nodes():
+            await self._cluster.initialize()
+        masters = {slot: nodes[0].name for slot, nodes in self._cluster.nodes_manager.slots_cache.items()}
+        keys, left = (f"{name}:{n}" for n in count()), set(masters.values())
+        found = list[str]()
+        while left:
+            key = next(keys)
+            if (master := masters.get(key_slot(key.encode()))) in left:
+                left.remove(master)
+                found.append(key)
+        return found
 
     def _look_again(self) -> None:
         """Starts a task that asks which node has which keys: a silent node would use up a caller's time."""
@@ -76,14 +88,15 @@ class Wires:
     async def _sent_on(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         written = await self._cluster.eval(script.text, len(keys), *keys, *args)
         if self._replicas:
-            # WAIT covers all that the node has done before the last command on this connection: that command
-            # reads the version, which shows that the node has, and still has, what was written.
+            # WAIT covers all that the node has done before the last write on this connection. So the script
+            # runs again, which shows that the node has, and still has, what was written.
             node, longest = self._cluster.get_node_from_key(keys[0]), int(PART * 1000 * self._timeout)
             pipe = self._cluster.pipeline()
-            pipe.execute_command("HGET", keys[0], "version", target_nodes=node)
+            pipe.execute_command("EVAL", script.text, len(keys), *keys, *args, target_nodes=node)
             pipe.execute_command("WAIT", self._replicas, longest, target_nodes=node)
             found, count = await pipe.execute()
-            if found != (written if isinstance(written, bytes) else written[2]) or count < self._replicas:
+            one, other = (each if isinstance(each, bytes) else each[2] for each in (written, found))
+            if one != other or count < self._replicas:
                 raise too_few(count, self._replicas)
         return written
 
