@@ -200,7 +200,8 @@ def test_content_is_bytes_a_text_or_a_file(tmp_path: Path):
         with pytest.raises(errors.InputError, match=r"\.pgm") as caught:
             wire.content(wrong, "image")
         assert caught.value.path == "image"
-    assert wire.content("flat.pgm", "name") == b"flat.pgm"
+    for text, where in (("flat.pgm", "name"), ("resolution: 0.05\nimage: flat.pgm", "metadata")):
+        assert wire.content(text, where) == text.encode()
 
 
 def test_an_id_cannot_leave_its_place_in_the_path():

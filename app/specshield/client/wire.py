@@ -152,7 +152,7 @@ def content(source: Content, where: str) -> bytes:
         except OSError as error:
             told, expected = f"{where} cannot be read: {error.strerror}", "a file that can be read"
             raise InputError(told, path=where, got=str(source), expected=expected) from error
-    if isinstance(source, str) and where != "name" and source.endswith(FILES):
+    if isinstance(source, str) and where != "name" and source.endswith(FILES) and "\n" not in source:
         told, expected = "this text is the name of a file, not its content", f"pathlib.Path({source!r})"
         raise InputError(told, path=where, got=source, expected=expected)
     return source.encode() if isinstance(source, str) else source
