@@ -241,6 +241,8 @@ def test_wrong_messages_are_refused_by_path(info, data, path):
 def test_of_a_message_that_ros2_topic_echo_cut_off_it_is_said_how_to_get_it_whole():
     with pytest.raises(MapError, match=r"cells were cut off.*--full-length"):
         from_occupancy_grid(message(), [0, 0, "..."])
+    with pytest.raises(MapError, match="data is not a usable list"):
+        from_occupancy_grid(message(), b"\0\0\0")
 
 
 @pytest.mark.skipif(not MAPS.is_dir(), reason="there is no folder ../shared/data/maps")

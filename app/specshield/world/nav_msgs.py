@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
         for key in "xy"
     )
     yaw = _yaw(checks.member(origin, "orientation", "info.origin"))
-    if isinstance(data, Sequence) and "..." in data[-1:]:
+    if isinstance(data, list) and data[-1:] == ["..."]:
         told, expected = "the cells were cut off", "all cells, as `ros2 topic echo --full-length` writes them"
         raise MapError(told, path="data", got=checks.shown(data), expected=expected)
     checks.items(data, "data", width * height, width * height)
