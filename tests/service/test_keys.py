@@ -250,11 +250,17 @@ def test_a_key_whose_sessions_fill_its_part_of_the_archive_begins_none(tmp_path)
         serving(tmp_path / "data", SPECSHIELD_API_KEY="operator", **settings) as server,
         caller(server, "gina") as gina,
         caller(server, "hal") as hal,
+        httpx.Client(
+            base_url=server.url, timeout=None, headers={"Authorization": "Bearer operator"}
+        ) as operator,
     ):
+        kept = tmp_path / "data" / "archive" / "@"  # before those of gina, so that it counts too
+        wait_for(lambda: begin(operator).status_code == 201 and kept.exists())
         wait_for(lambda: begin(gina).status_code == 429)
         found = problem(begin(gina), 429, "limit-reached")
         assert "this key's sessions in the archive take" in found["detail"]
         assert begin(hal).status_code == 201
+        assert begin(operator).status_code == 201
         for session in gina.get("/v1/sessions").json()["items"]:
             assert gina.delete(f"/v1/sessions/{session['id']}").status_code == 204
         wait_for(lambda: begin(gina).status_code == 201)

@@ -237,7 +237,7 @@ class Sessions:
         """The limits on the number of sessions that apply to a caller. Raises LimitReached."""
         archived = self._store.archived
         for whose, size, setting in (
-            ("this key's", archived.get(key.name, 0), "max_owner_archive_bytes"),
+            ("this key's", archived.get(key.name, 0) if key.name else 0, "max_owner_archive_bytes"),
             ("all", sum(archived.values()), "archive_bytes"),
         ):
             if size >= (most := getattr(self._settings, setting)):
