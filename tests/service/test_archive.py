@@ -152,6 +152,20 @@ def test_a_session_that_has_left_is_read_byte_for_byte_and_goes_on(url, archive)
     run(url, archive, story)
 
 
+def test_a_session_that_moves_again_is_counted_once(url, archive):
+    async def story(store):
+        version = await begin(store, "twice@robot", 1)
+        for t in (1, 2, 3):
+            await move(store, "twice@robot")
+            version = await store.append("twice@robot", version, change(t))
+        await move(store, "twice@robot")
+        ((entry, size),) = archive.sizes()
+        assert entry.key == "twice@robot"
+        assert (await store.sizes())["twice"] == size
+
+    run(url, archive, story)
+
+
 def test_two_servers_that_bring_a_session_back_decide_one_step(url, archive):
     async def story(store):
         version = await begin(store, "robot", 3)

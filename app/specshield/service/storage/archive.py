@@ -111,6 +111,16 @@ class Archive:
     def remove(self, entry: Entry) -> None:
         self._objects.remove(entry.path)
 
+    def remove_older(self, entry: Entry) -> int:
+        """Removes the older files of the session. Returns their bytes."""
+        gone = 0
+        for path, size in self._objects.sizes(_folder(entry.key)):
+            other = Entry.of(entry.key, path.rpartition("/")[2])
+            if other is not None and other < entry:
+                self.remove(other)
+                gone += size
+        return gone
+
     def erase(self, key: str) -> int:
         """Removes all files of a session. Returns their bytes, 0 if there was none."""
         size = sum(size for _, size in self._objects.sizes(_folder(key)))

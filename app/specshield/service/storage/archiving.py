@@ -199,13 +199,12 @@ class ArchivingStore(Store):
             left = await self._leave(keys=_keys(id), args=[dump.version, FENCE])
             if left > 0:
                 await self.take_off([id.encode()])
-        await self.count_bytes(owner_of(id), size)
         if left > 0:
-            for other in await self.in_thread(self.archive.entries, id):
-                if other < entry:
-                    await self.in_thread(self.archive.remove, other)
+            size -= await self.in_thread(self.archive.remove_older, entry)
         else:
             await self.in_thread(self.archive.remove, entry)
+            size = 0
+        await self.count_bytes(owner_of(id), size)
         return bool(left > 0)
 
     async def _bring_back(self, id: str) -> bool:
