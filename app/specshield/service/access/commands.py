@@ -42,9 +42,8 @@ def show() -> None:
         typer.echo("there are no keys", err=True)
     for key in listed:
         limits = {"requests a second": key.requests, "sessions": key.sessions, "bytes": key.bytes}
-        told = ", ".join(
-            f"{limit:,} {what}".replace(".0 ", " ") for what, limit in limits.items() if limit is not None
-        )
+        given = {what: f"{limit:,}".removesuffix(".0") for what, limit in limits.items() if limit is not None}
+        told = ", ".join(f"{limit} {what}" for what, limit in given.items())
         print(f"{key.name}  made {key.created_at}  {told or 'no limits'}")
 
 

@@ -36,7 +36,7 @@ DAMAGED = (ValueError, zstandard.ZstdError)  # raised for a file that is damaged
 
 @dataclass(frozen=True, order=True)
 class Entry:
-    """One file. until: `expires` as its name tells it."""
+    """One file. until: when it is erased, in the digits of the file's name."""
 
     key: str
     changes: int
