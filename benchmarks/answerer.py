@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from specshield.episode import decide, make_shield
 from specshield.policy.methods import load_policy
-from specshield.shield.episode import decide, make_shield
 from specshield.shipped import MODELS
 from specshield.sim.cases import load_case
 

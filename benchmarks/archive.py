@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.states import along
 from evaluation.shipped import shipped
+from specshield import episode
 from specshield.service.sessions import record
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.state import State
@@ -32,7 +33,6 @@ from specshield.service.storage.archiving import FENCE, RETURN, ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
 from specshield.service.storage.store import Dump, keys
-from specshield.shield import episode
 from specshield.shield.decision import make_shield
 from specshield.sim.cases import load_case
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from benchmarks.rules import feasible_starts, run
 from evaluation.statistics import clopper_pearson
+from specshield.episode import Config, make_shield
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
-from specshield.shield.episode import Config, make_shield
 from specshield.sim.cases import load_case
 
 Floats = NDArray[np.float64]

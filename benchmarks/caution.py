@@ -24,8 +24,8 @@ from evaluation.experiment import SESSIONS, Experiment
 from evaluation.methods import Shielded
 from evaluation.runs import run_by
 from evaluation.shipped import shipped
+from specshield.episode import Shield, decide, make_shield
 from specshield.shield.decision import Config
-from specshield.shield.episode import Shield, decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import Case, load_case
 

@@ -40,8 +40,8 @@ def main(case_name: str, method: str) -> None:
     import numpy as np
 
     from benchmarks.states import shipped_dqn
+    from specshield.episode import decide, make_shield
     from specshield.policy.reachability import policy as reachability
-    from specshield.shield.episode import decide, make_shield
     from specshield.sim.cases import load_case
 
     lap("import")

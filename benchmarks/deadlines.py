@@ -22,12 +22,12 @@ import numpy as np
 from benchmarks.exact import MOST, Floats, Goal, fewest_steps
 from evaluation.model.floor_plans import House, random_house
 from evaluation.statistics import clopper_pearson
+from specshield.episode import Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
-from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.task import Task, make_task
 
 SPARE = 5  # 0 to 4 steps between what the search needs and the deadline

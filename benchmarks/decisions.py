@@ -11,8 +11,8 @@ import numpy as np
 from benchmarks.plain import Plain
 from benchmarks.states import Floats, State, along, shipped_dqn, starts
 from benchmarks.timing import quietest, summary
+from specshield.episode import Shield, decide, make_shield
 from specshield.policy.reachability import policy as reachability
-from specshield.shield.episode import Shield, decide, make_shield
 from specshield.shield.feasibility import futures, prefix_of, simulated
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.sim.cases import load_case

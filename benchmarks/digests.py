@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from benchmarks.rules import RULES
 from benchmarks.rules import make as make_rule
 from evaluation.shipped import shipped
+from specshield.episode import Config, Decision, Shield, decide, make_shield
 from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.planner import policy as planner
 from specshield.robot import STRETCH
-from specshield.shield.episode import Config, Decision, Shield, decide, make_shield
 from specshield.sim.cases import Case, load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarks.states import starts
 from benchmarks.timing import one_core, summary
 from evaluation.shipped import shipped
-from specshield.shield.episode import Decision, Shield, decide, make_shield
+from specshield.episode import Decision, Shield, decide, make_shield
 from specshield.sim.cases import Case, load_case
 from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import SimulatedRobot

@@ -15,12 +15,12 @@ import time
 import numpy as np
 
 from benchmarks.exact import NOWHERE, Goal, fewest_steps
+from specshield.episode import make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import make_shield, start
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 

@@ -24,13 +24,13 @@ from evaluation.experiment import SESSIONS
 from evaluation.methods import Method, Shielded
 from evaluation.worlds.runs import SENSING, Trial, run_in
 from evaluation.worlds.world import WORLDS
+from specshield.episode import Config, Shield, make_shield, start
 from specshield.errors import SpecshieldError
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.methods import DEFAULT
 from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import synthesise as make_tables
 from specshield.service.warmup import PARTS, warm_up
-from specshield.shield.episode import Config, Shield, make_shield, start
 from specshield.sim.cases import Case, load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import Pose, SimulatedRobot

@@ -6,7 +6,7 @@ A Stretch drives to a place of its own in the maps of cases 1 and 2, from anywhe
 continuation leads it. Each motion ends off by sigma 1 cm along x and along y and by sigma half a degree, or
 closer where that would be inside an obstacle. Nothing is asked beyond the rule. Printed: how often the robot
 comes more than k steps later than the first continuation would have; and what V of a threshold over the
-episode expects (shield/caution/threshold.py): a normal deviate, rounded to whole steps, and now and then a
+episode expects (caution/threshold.py): a normal deviate, rounded to whole steps, and now and then a
 longer delay.
 """
 
@@ -18,13 +18,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.caution.noise import Noise, above, spread_of
+from specshield.caution.threshold import FOR, HELD_UP
+from specshield.episode import Config, Shield, decide, make_shield, start
 from specshield.errors import SpecshieldError
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, in_collision, make_body, successors, wrap
-from specshield.shield.caution.threshold import FOR, HELD_UP
-from specshield.shield.episode import Config, Shield, decide, make_shield, start
-from specshield.shield.uncertainty import Noise, above, spread_of
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

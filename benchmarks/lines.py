@@ -23,10 +23,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 APP = REPOSITORY / "app"
 PACKAGE = APP / "specshield"
 PAPER = REPOSITORY / "docs" / "architecture.md"  # it names each module of the trusted core with its lines
-TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield")  # what the guarantee rests on
-MOST_TRUSTED = 7_686  # lines of the trusted core
+TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield", "episode")  # what the guarantee rests on
+MOST_TRUSTED = 5_400  # lines of the trusted core
 AIM = 17_000  # lines of app/ that the project wants to come down to
-MOST = 38_831
+MOST = 38_971
 LONGEST = 350  # lines of one module
 FULLEST = 14  # files in one folder, at one level
 

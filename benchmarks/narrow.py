@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from benchmarks.exact import MOST, NOWHERE, Goal, fewest_steps
 from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
+from specshield.episode import Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH, Robot, robot_from_json
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.task import make_task
 
 Floats = NDArray[np.float64]

@@ -19,12 +19,12 @@ import numpy as np
 from benchmarks.exact import MOST, NOWHERE, Goal, fewest_steps
 from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
+from specshield.episode import make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import Robot, robot_from_json
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import make_shield, start
 from specshield.task import make_task
 
 TURNS = (0.5236, 0.5, 0.3, 0.7854, 0.4, 0.35, 0.6, 0.25, 0.9, 1.1)  # [rad]

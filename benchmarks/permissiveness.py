@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
 from evaluation.shipped import shipped
+from specshield.caution.surprise.barred import NOTHING_BARRED
+from specshield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.progress import make_rules, replay
@@ -32,9 +34,7 @@ from specshield.policy.reachability.guide import make_scratch
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.policy.reachability.tables import Guide, slack
-from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, in_collision, motion_count, simulate, step
-from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.shield.proposal import Proposer
 from specshield.sim.cases import Case, case_names, load_case
 from specshield.sim.model import GoalSeeker

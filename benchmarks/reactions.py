@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 
 from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
+from specshield.caution.signals import any_signal
+from specshield.episode import decide
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.geodesic import geodesic_distance
 from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, successors
 from specshield.shield.decision import Carry, Config, Shield, make_shield
-from specshield.shield.episode import decide
-from specshield.shield.signals import any_signal
 from specshield.stl import robustness
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid

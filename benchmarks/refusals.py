@@ -22,12 +22,12 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.ways import Floats, Part, earliest, rule
+from specshield.episode import make_shield
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import proof
 from specshield.reasons.relaxation import relaxations
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
-from specshield.shield.episode import make_shield
 from specshield.shield.proposal import Proposal
 from specshield.sim.cases import case_names, load_case
 from specshield.task import Task, make_task

@@ -20,12 +20,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.episode import Carry, Config, Shield, close, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.policy import PlannerPolicy, synthesise
 from specshield.robot import STRETCH
-from specshield.shield.episode import Carry, Config, Shield, close, decide, make_shield, start
 from specshield.sim.cases import Case, load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot

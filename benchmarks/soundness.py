@@ -24,13 +24,13 @@ from benchmarks import narrow
 from benchmarks.judge import Floats, distance
 from benchmarks.plain_world import World
 from evaluation.model.floor_plans import random_house
+from specshield.episode import Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.task import make_task
 from tests.oracles.brute_stl import brute_robustness
 

@@ -14,8 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from evaluation.evaluation import read, read_about
+from specshield.episode import decide, make_shield
 from specshield.shield.decision import Config
-from specshield.shield.episode import decide, make_shield
 
 MOST = 60  # [steps]
 BOUNDS = (0, 3, 6, 9, 12, MOST + 1)  # [steps] of the columns

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.shipped import shipped
+from specshield.episode import Carry, Shield, decide, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.policy import Policy
-from specshield.shield.episode import Carry, Shield, decide, start
 from specshield.sim.cases import Case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot

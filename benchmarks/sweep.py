@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.decisions import ask, warm
 from benchmarks.states import State, shipped_dqn
 from benchmarks.timing import summary
+from specshield.episode import decide, make_shield
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.network import NAMES, make_network
@@ -22,7 +23,6 @@ from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action
 from specshield.robot.dynamics import make_body, motion_count
-from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.stl import SATISFIED_ABOVE, robustness_bounds
 from specshield.task import Task, make_task

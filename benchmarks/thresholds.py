@@ -24,10 +24,10 @@ from scipy.stats import binomtest
 
 from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, SHAPES, World, make_world
+from specshield.episode import Carry, Config, Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import in_collision, make_body, step
-from specshield.shield.episode import Carry, Config, Shield, decide, make_shield, start
 from specshield.shield.uncertainty import Uncertainty
 
 Floats = NDArray[np.float64]

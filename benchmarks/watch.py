@@ -32,8 +32,8 @@ def main() -> None:
 
 def measure() -> None:
     from evaluation.shipped import shipped
+    from specshield.episode import decide, make_shield
     from specshield.service import metrics
-    from specshield.shield.episode import decide, make_shield
     from specshield.sim.cases import load_case
 
     shield = make_shield([shipped(load_case("case1"), "reachability")])

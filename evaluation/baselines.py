@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from evaluation.methods import Answer, Decoding, Floats, Shielded, drawn
+from specshield.episode import Decision, Shield
 from specshield.shield import shaping
-from specshield.shield.episode import Decision, Shield
 from specshield.stl import SATISFIED_ABOVE, Always, conjuncts, robustness_bounds
 from specshield.task import Task
 

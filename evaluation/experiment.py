@@ -19,13 +19,13 @@ from evaluation.shipped import shipped
 from evaluation.slacks import Adaptive, proportional
 from evaluation.tasks import MainTask, main_task
 from specshield import __version__
+from specshield.episode import Shield, make_shield
 from specshield.errors import InputError, NotFound
 from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.decision import Config, ThresholdOver
-from specshield.shield.episode import Shield, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS
 from specshield.sim.cases import Case, case_name, case_names, load_case

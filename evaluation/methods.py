@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.decoding import HardDecoding, RobustDecoding
+from specshield.episode import Carry, Decision, Shield, decide
 from specshield.errors import InputError
 from specshield.shield import shaping
-from specshield.shield.episode import Carry, Decision, Shield, decide
 from specshield.stl import Verdict
 from specshield.task import Task
 

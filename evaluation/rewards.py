@@ -15,10 +15,10 @@ from evaluation.methods import Shielded
 from evaluation.results import markdown
 from evaluation.runs import Record, run_by
 from evaluation.statistics import clopper_pearson, mean_of
+from specshield.episode import Shield, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.policy import Policy, load_dqn
 from specshield.policy.reachability.policy import synthesise
-from specshield.shield.episode import Shield, make_shield, start
 from specshield.shipped import MODELS
 from specshield.sim import training
 from specshield.sim.cases import case_name, case_names, load_case

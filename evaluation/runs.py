@@ -21,10 +21,10 @@ from evaluation import conformal, disturbance
 from evaluation.experiment import Experiment, Setting
 from evaluation.methods import Answer, Method
 from evaluation.tasks import MAX_STEPS, is_done
+from specshield.episode import Shield, decide, start
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot.dynamics import in_collision, simulate, step
-from specshield.shield.episode import Shield, decide, start
 from specshield.sim.cases import Case
 from specshield.sim.robot import Pose, SimulatedRobot
 from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness

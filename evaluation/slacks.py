@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from evaluation.methods import Answer, Floats, Shielded
+from specshield.episode import Shield
 from specshield.shield.decision import Config
-from specshield.shield.episode import Shield
 from specshield.stl import Eventually, conjuncts
 from specshield.task import Task
 

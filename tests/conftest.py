@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from evaluation.shipped import shipped
-from specshield.shield.episode import Shield, make_shield
+from specshield.episode import Shield, make_shield
 from specshield.sim.cases import Case, case_names, load_case
 from tests.serving import RunningServer, serving
 

@@ -5,11 +5,11 @@ import hashlib
 import numpy as np
 
 from evaluation.shipped import shipped
+from specshield.episode import decide, make_shield
 from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot.dynamics import make_body
 from specshield.shield.decision import Config
-from specshield.shield.episode import decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import load_case
 

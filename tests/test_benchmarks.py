@@ -16,10 +16,10 @@ from benchmarks.episodes import HERE, measure
 from benchmarks.plain import Plain
 from benchmarks.states import shipped_dqn, starts
 from benchmarks.sweep import made_robot
+from specshield.episode import decide, make_shield
 from specshield.policy.progress import BROKEN, SETTLED, make_rules, replay
 from specshield.policy.reachability import policy as reachability
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.stl import SATISFIED_ABOVE, robustness
 

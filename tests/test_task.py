@@ -11,11 +11,11 @@ import weakref
 import numpy as np
 import pytest
 
+from specshield import episode
 from specshield.errors import FormulaError, HorizonError, MapError, SampleError
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.rule.view import look, view_of
-from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.stl import robustness

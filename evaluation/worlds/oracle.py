@@ -10,9 +10,9 @@ from functools import lru_cache
 import numpy as np
 
 from evaluation.worlds.world import STAYS, World
+from specshield.episode import make_shield, start
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.robot.dynamics import step
-from specshield.shield.episode import make_shield, start
 from specshield.shield.proposal import Proposer
 from specshield.sim.robot import Pose
 from specshield.stl import SATISFIED_ABOVE, robustness

@@ -15,13 +15,13 @@ from evaluation.models import named
 from evaluation.worlds.oracle import Make, can_keep
 from evaluation.worlds.robots import ROBOTS
 from evaluation.worlds.world import STAYS, World, look, make_world
+from specshield.episode import Shield, decide, make_shield, start
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import in_collision, simulate
 from specshield.service.warmup import PARTS, warm_up
 from specshield.shield.decision import Carry, Config
-from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import Case, load_case
 from specshield.sim.robot import Pose, SimulatedRobot

@@ -8,7 +8,7 @@ import pytest
 from evaluation.baselines import Completed, RuleFirst, Switching, VisitsFirst, breaks_now, met
 from evaluation.decoding import HardDecoding
 from evaluation.methods import Decoding
-from specshield.shield.episode import make_shield
+from specshield.episode import make_shield
 from specshield.shield.shaping import log_softmax
 from tests.oracles.cells import END, FORWARD, RIGHT, WAIT, Cells, Exhaustive
 

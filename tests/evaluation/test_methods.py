@@ -7,7 +7,7 @@ import pytest
 
 from evaluation.decoding import HardDecoding, RobustDecoding
 from evaluation.methods import Decoding, Shielded, Simplex, drawn
-from specshield.shield.episode import decide, make_shield
+from specshield.episode import decide, make_shield
 from specshield.shield.shaping import log_softmax
 from tests.oracles.cells import END, FORWARD, LEFT, RIGHT, WAIT, Cells, Exhaustive
 

@@ -9,12 +9,12 @@ import pytest
 
 from benchmarks.states import shipped_dqn
 from benchmarks.sweep import made_robot, widened
+from specshield.episode import decide, make_shield
 from specshield.policy.detour import find_sibling, find_twins, join
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 
+from specshield.episode import decide, make_shield
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.shield.decision import Config
-from specshield.shield.episode import decide, make_shield
 from specshield.shield.proposal import Proposal
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

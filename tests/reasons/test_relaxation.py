@@ -6,13 +6,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from specshield.handover import begun
+from specshield.episode import decide, make_shield
+from specshield.episode.handover import begun
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.lateness import driven
 from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations, way
 from specshield.robot import robot_from_json
-from specshield.shield.episode import decide, make_shield
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import Scripted, waits

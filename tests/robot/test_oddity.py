@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from specshield.shield.episode import decide, make_shield
+from specshield.episode import decide, make_shield
 from tests.oracles.cells import Cells, Scripted, waits
 
 EVEN = np.zeros(5)

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from specshield.caution.taught import Taught
 from specshield.service.app import create_app
 from specshield.service.library.files import Recent
 from specshield.service.sessions.session import Session
@@ -17,7 +18,6 @@ from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Record
 from specshield.shield.decision import Carry
-from specshield.shield.taught import Taught
 from specshield.task import Task
 from specshield.world.learned import LearnedMap
 from tests.service.world import LOGITS, START, grid_json, policy_files

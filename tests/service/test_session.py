@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from specshield.episode.handover import check_signals
 from specshield.errors import SampleError
-from specshield.handover import check_signals
 from specshield.robot import STRETCH
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

@@ -17,7 +17,7 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.service import warmup
-from specshield.shield import episode
+from specshield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS

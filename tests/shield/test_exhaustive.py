@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from specshield.episode import decide, make_shield, start
 from specshield.errors import InfeasibleStart
-from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
 from tests.oracles.cells import END, MOTIONS, ROBOT, Cells, Exhaustive, Scripted, waits
 

@@ -1,6 +1,7 @@
 """Proposers that lie or fail: nothing is certified without a future that keeps the rule.
 
-The world of test_episode.py: a robot in the lower left corner of a few cells, A is the cell ahead of it.
+The world of tests/episode/test_algorithm.py: a robot in the lower left corner of a few cells, A is the cell
+ahead of it.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specshield.shield.episode import Config, InfeasibleStart, decide, make_shield, start
+from specshield.episode import Config, decide, make_shield, start
+from specshield.errors import InfeasibleStart
 from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal, adapted, ask
 from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits

@@ -8,9 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from specshield.episode import decide, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.shield.episode import decide, start
 from specshield.shield.shaping import log_softmax
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot

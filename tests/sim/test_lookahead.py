@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from evaluation.shipped import shipped
+from specshield.episode import close, decide, make_shield, start
 from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.portable import exp
 from specshield.service.sessions.state import State
 from specshield.shield.decision import Config
-from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker

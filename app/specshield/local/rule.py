@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from specshield import episode
 from specshield.arrays import Floats
 from specshield.client.models import Pose, SpecStatus
+from specshield.episode.handover import rule_told
 from specshield.errors import InputError
-from specshield.handover import rule_told
-from specshield.shield import episode
 from specshield.shield.decision import Shield
 
 if TYPE_CHECKING:

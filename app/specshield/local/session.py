@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from specshield import handover
+from specshield import episode
+from specshield.caution.signals import any_signal
+from specshield.caution.surprise.slip import SAME_POSE
 from specshield.client import wire
 from specshield.client.models import (
     Decision,
@@ -24,16 +26,14 @@ from specshield.client.models import (
 )
 from specshield.client.wire import Logits, Numbers, Points
 from specshield.client.wiring import Wiring
+from specshield.episode import handover
 from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished
 from specshield.local.rule import Rule, told
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
 from specshield.robot.dynamics import wrap
 from specshield.shield import decision as core
-from specshield.shield import episode
 from specshield.shield.decision import Shield
-from specshield.shield.signals import any_signal
-from specshield.shield.surprise.slip import SAME_POSE
 from specshield.task import Task
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from specshield.caution.signals import any_signal
 from specshield.client.models import SessionInfo
 from specshield.client.wire import pose_values
 from specshield.errors import MapError, NotFound, PolicyError
@@ -27,7 +28,6 @@ from specshield.policy.options import read_options
 from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
-from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task
 from specshield.world.formats import read_map

@@ -11,16 +11,16 @@ from dataclasses import replace
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.caution.signals import any_signal
+from specshield.caution.worst import worst_signals
+from specshield.episode import start
 from specshield.errors import InfeasibleStart, MapError, SampleError
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import contradiction, idle
 from specshield.reasons.relaxation import way
 from specshield.robot import Robot
-from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
-from specshield.shield.episode import start
 from specshield.shield.proposal import Proposer
-from specshield.shield.signals import any_signal
 
 STARTS = 16  # poses that a new policy is tried from. By hand, so that all of this takes a second or two.
 MOST_SEARCHED = 4  # of those from which it has no future

@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Floats, Ints
+from specshield.caution.escape import spread
 from specshield.reasons.course import Goal, course, possible
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
 from specshield.reasons.needs import Need, Reader, positive
 from specshield.robot.dynamics import Body, in_collision, motion_count
-from specshield.shield.escape import spread
 from specshield.stl import Always, Atom, Comparison, Not
 from specshield.stl.formula import Node
 from specshield.task import Task

@@ -18,14 +18,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
+from specshield.caution.early import conjunction_of, find_open, rate_open
+from specshield.caution.judgement import Judged
+from specshield.caution.residual import again, left_over
+from specshield.caution.room import ROOM
 from specshield.reasons.lateness import driven, in_words, late_by, later, steps, values_of, when
 from specshield.robot.dynamics import motion_count
-from specshield.robot.room import ROOM
-from specshield.rule.early import conjunction_of, find_open, rate_open
-from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix, rho_of
-from specshield.shield.judgement import Judged
 from specshield.shield.proposal import adapted, ask
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
@@ -45,7 +45,7 @@ def explanations(
     """One an action: None where it is allowed, or terminal.
 
     prefix: for the whole formula. judged: None if the rule forbids nothing any more. doubtful [M]: the
-    motions that had better not be drawn (`doubtful` in shield/taught.py).
+    motions that had better not be drawn (`doubtful` in caution/taught.py).
     """
     robot = shield.task.robot
     if judged is None or not prefix.formula.names:

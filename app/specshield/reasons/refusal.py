@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.caution.taught import on_map, teach
+from specshield.episode import check_switch, start
+from specshield.episode.handover import finite
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
-from specshield.handover import finite
 from specshield.reasons.bound import proof
 from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.episode import check_switch, start
 from specshield.shield.feasibility import Signals
-from specshield.shield.taught import on_map, teach
 from specshield.world.learned import SENT, forget
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
+from specshield.caution.residual import all_of
 from specshield.reasons.course import Goal, course
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
@@ -21,7 +22,6 @@ from specshield.reasons.lateness import driven, late_by, later, may_be_late, val
 from specshield.reasons.needs import Alternatives, Need, Reader
 from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
-from specshield.rule.residual import all_of
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import futures, prefix_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts

@@ -16,11 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
+from specshield.caution.escape import spread
 from specshield.reasons.ground import Ground
 from specshield.reasons.known import Known
 from specshield.reasons.needs import Need
 from specshield.robot.dynamics import Body, calmest_motion, motion_count
-from specshield.shield.escape import spread
 from specshield.stl import SATISFIED_ABOVE
 
 # Chosen by hand: a search takes a second at most.

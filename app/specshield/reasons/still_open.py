@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.rule.residual import all_of
+from specshield.caution.residual import all_of
 from specshield.rule.view import look, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 from specshield.task import Task

@@ -13,7 +13,7 @@ from specshield.arrays import Bools, Ints
 from specshield.errors import RobotError
 from specshield.world.checks import shown
 
-# A witness is stored as one byte a motion: the uint8 in shield/judgement.py and shield/feasibility.py holds
+# A witness is stored as one byte a motion: the uint8 in caution/judgement.py and shield/feasibility.py holds
 # no motion above 255. More actions than this would need wider witnesses there.
 MAX_ACTIONS = 256
 MAX_TRANSLATE = 10.0  # [m] a step

@@ -1,1 +1,1 @@
-"""What a formula says of a trajectory: its robustness and bounds, what is open, what is left of it."""
+"""What a formula says of a trajectory: its values, its robustness and the bounds on it."""

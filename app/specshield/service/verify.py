@@ -12,8 +12,9 @@ import msgspec
 import numpy as np
 
 from specshield import __version__
+from specshield.caution.taught import Taught
+from specshield.episode.handover import begun
 from specshield.errors import InputError, NotFound, SpecshieldError
-from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
@@ -26,7 +27,6 @@ from specshield.service.sessions.rules import carried_over, way
 from specshield.service.sessions.session import decide
 from specshield.service.settings import Settings
 from specshield.shield.decision import Carry, Shield, make_shield
-from specshield.shield.taught import Taught
 from specshield.world.learned import LearnedMap
 
 

@@ -21,7 +21,11 @@ from llvmlite.binding import ffi
 from numba.core.caching import IndexDataCacheFile
 from numba.core.lowering import BaseLower
 
+from specshield import episode
 from specshield.arrays import Floats
+from specshield.caution.experience import was_stopped
+from specshield.caution.surprise.barred import NOTHING_BARRED
+from specshield.caution.surprise.contact import cells_met
 from specshield.compiled import box
 from specshield.policy.lattice import Lattice
 from specshield.policy.progress import make_rules
@@ -34,15 +38,12 @@ from specshield.policy.reachability.tables import Guide
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
-from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import make_body, motion_count, overlap, step, successors
 from specshield.service.sessions import packing, record
 from specshield.service.storage.keeper import at_end_of_input
-from specshield.shield import episode, shaping
-from specshield.shield.caution.experience import was_stopped
+from specshield.shield import shaping
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.proposal import Proposal
-from specshield.shield.surprise.contact import cells_met
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid

@@ -1,4 +1,4 @@
-"""The distribution that answers a step, given what its futures say of each action (Algorithm 1)."""
+"""The distribution that answers a step, given what is certified of each action (Algorithm 1)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.portable import exp
 from specshield.shield import shaping
+from specshield.shield.certificate import Certified
 from specshield.shield.decision import Mode, Reason, Shield
-from specshield.shield.judgement import Judged
 
 
 class Answer(NamedTuple):
@@ -25,7 +25,7 @@ class Answer(NamedTuple):
 def answer_of(
     shield: Shield,
     log_prior: Floats | None,
-    judged: Judged,
+    certified: Certified,
     main_task_done: bool,
     weights: Floats | None,
     chance: Floats | None,
@@ -37,34 +37,34 @@ def answer_of(
     weights [A]: a preference's log-weights, which are added to the model's log-probabilities inside S_t.
     chance [A], left: V and d_t / V* of a threshold over the episode (caution/threshold.py).
     """
-    terminal, any_feasible = shield.task.robot.terminal, judged.some
-    said: Reason | None = "margin_unattainable" if judged.aimed.lowered else None
-    certified = all_on(judged.completion, len(terminal))
+    terminal, any_feasible = shield.task.robot.terminal, certified.some
+    said: Reason | None = "margin_unattainable" if certified.lowered else None
+    completing = all_on(certified.completion, len(terminal))
     conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
     if main_task_done or log_prior is None:
         mode: Mode = "completion" if any_feasible else "fallback"
-        return Answer(certified, mode, said if any_feasible else "infeasible", conditional)
+        return Answer(completing, mode, said if any_feasible else "infeasible", conditional)
     mode = "shaped" if any_feasible else "fallback"
     if conditional is None:  # the model ends for certain
         return Answer(exp(log_prior), mode, None if any_feasible else "infeasible")
     config, attainable = shield.config, any_feasible
     if config.evaluation == "robustness":
-        shaped = shaping.tilt(conditional, judged.values, config.threshold)
-        attainable = bool(judged.values.max() >= config.threshold)
+        shaped = shaping.tilt(conditional, certified.values, config.threshold)
+        attainable = bool(certified.values.max() >= config.threshold)
     elif chance is not None and chance.max() > 0.0:
         shaped = None
         if left > 1.0 - 1e-9:  # the best chance is asked for: of the actions that have it, those in S_t
-            shaped = shaping.restrict(conditional, judged.feasible & (chance >= chance.max()))
+            shaped = shaping.restrict(conditional, certified.feasible & (chance >= chance.max()))
         if shaped is None:
             shaped = shaping.tilt(conditional, chance, left * float(chance.max()))
     elif config.threshold == 1.0 or config.threshold_over == "episode":
         wanted = conditional if weights is None else conditional + weights
-        shaped = shaping.restrict(wanted, judged.feasible)
+        shaped = shaping.restrict(wanted, certified.feasible)
     else:
-        shaped = shaping.soften(conditional, judged.feasible, config.threshold)
+        shaped = shaping.soften(conditional, certified.feasible, config.threshold)
     mode = "shaped"
     if shaped is None:
-        mode, said, shaped = "fallback", "zero_prior_mass" if attainable else "infeasible", certified
+        mode, said, shaped = "fallback", "zero_prior_mass" if attainable else "infeasible", completing
     return Answer(shaping.with_ending(shaped, log_prior, ending, terminal), mode, said, conditional)
 
 

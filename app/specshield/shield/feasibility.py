@@ -91,7 +91,8 @@ class Futures(NamedTuple):
     motions [N, T - t]: a future belongs to its first motion. poses [N, T - t, 3]: where they lead. rho [N]:
     of each future joined to the prefix; -inf if its simulation was given up. leaves [N, size]: the values of
     the formula's leaves along each future that was not given up. preferred: the motion that the first
-    proposer would make itself. warnings: which proposers were not used and why.
+    proposer would make itself. warnings: which proposers were not used and why. prefix, body: what they were
+    simulated and judged with. Only `simulated` and `together` make such futures.
     """
 
     motions: Ints
@@ -100,6 +101,8 @@ class Futures(NamedTuple):
     leaves: Floats
     preferred: int
     warnings: tuple[str, ...]
+    prefix: Prefix
+    body: Body
 
 
 def futures(
@@ -142,14 +145,16 @@ def simulated(
     wait, written = prefix.task.robot.wait_motion, (motions, poses, rho, leaves)
     finite = _simulate_and_rate(body, *known, wait, not violated, *written)
     said = warnings if finite else [*warnings, NOT_FINITE]
-    return Futures(motions, poses, rho, leaves, preferred, tuple(dict.fromkeys(said)))
+    return Futures(motions, poses, rho, leaves, preferred, tuple(dict.fromkeys(said)), prefix, body)
 
 
 def together(tried: Futures, more: Futures) -> Futures:
-    """The futures of both; `more` says which motion is preferred."""
+    """The futures of both, simulated with the same prefix and body; `more` says which motion is preferred."""
+    if tried.prefix is not more.prefix or tried.body is not more.body:
+        raise ValueError("these futures belong to different prefixes or bodies")
     arrays = (np.concatenate(both) for both in zip(tried[:4], more[:4], strict=True))
     said = tuple(dict.fromkeys([*tried.warnings, *more.warnings]))
-    return Futures._make((*arrays, more.preferred, said))
+    return Futures._make((*arrays, more.preferred, said, more.prefix, more.body))
 
 
 def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:

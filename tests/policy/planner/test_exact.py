@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from benchmarks import deadlines
+from specshield.episode import decide, make_shield, start
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

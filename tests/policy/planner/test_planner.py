@@ -10,15 +10,15 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from specshield.caution.surprise.barred import in_vain
+from specshield.episode import Config, decide, make_shield, start
 from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.methods import Run, load_policy
 from specshield.policy.planner import first_motions
 from specshield.policy.planner import policy as planner
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.shield.uncertainty import Uncertainty
 from specshield.stl import robustness
 from specshield.task import make_task

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rules import RULES, feasible_starts, make, run
-from specshield.shield.episode import make_shield
+from specshield.episode import make_shield
 from tests.oracles.brute_stl import brute_robustness
 from tests.oracles.judge import signed_distance
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from specshield.caution.surprise.barred import NOTHING_BARRED
 from specshield.policy.progress import make_rules
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.tables import Guide
-from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import make_body
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from specshield.caution.surprise.barred import NOTHING_BARRED, in_vain
 from specshield.compiled import box
 from specshield.policy.progress import PENDING, SETTLED, make_rules
 from specshield.policy.progress.recall import pasts
@@ -14,7 +15,6 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.policy.reachability.tables import Guide
 from specshield.policy.tree import make_tree
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
 from specshield.task import make_task

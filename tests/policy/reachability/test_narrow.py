@@ -9,13 +9,13 @@ import pytest
 
 from benchmarks.exact import NOWHERE, Goal, fewest_steps
 from benchmarks.narrow import runs
+from specshield.episode import make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.methods import load_policy
 from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import make_shield, start
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load, save
 
+from specshield.episode import decide, make_shield, start
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.methods import load_policy
 from specshield.policy.reachability.policy import Settings, check, synthesise
 from specshield.policy.reachability.tables import LATE
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield, start
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import MOTIONS, ROBOT, WAIT, Cells

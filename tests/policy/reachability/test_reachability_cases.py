@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from specshield.episode import Config, decide, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import simulate
-from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.sim.cases import case_names, load_case
 from specshield.task import make_task
 from specshield.world.procthor import load_house

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from specshield.episode import decide, make_shield
 from specshield.policy.lattice import holds_at, make_lattice
 from specshield.policy.progress import make_rules
 from specshield.policy.reachability.policy import synthesise
@@ -18,7 +19,6 @@ from specshield.policy.reachability.stepwise import (
 )
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body
-from specshield.shield.episode import decide, make_shield
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import CELL

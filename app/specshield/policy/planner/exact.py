@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Ints
+from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.due_dates import NO_DATE, read_pose
 from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
 from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
 from specshield.policy.tree import Tree, is_new, make_tree, pop, push, put, trace
-from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Ints
-from specshield.rule.residual import all_of
+from specshield.caution.residual import all_of
+from specshield.caution.worst import alone
 from specshield.rule.view import View, view_of
-from specshield.rule.worst import alone
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until, conjuncts
 from specshield.stl.conjunction import is_predicate, signed
 from specshield.task import Task, kept_with_task

@@ -21,6 +21,9 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Codes, Floats, Int32s
+from specshield.caution.residual import all_of
+from specshield.caution.surprise.barred import NOTHING_BARRED
+from specshield.caution.worst import moved, worst_signals
 from specshield.compiled import box
 from specshield.errors import MapError, PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
@@ -41,12 +44,9 @@ from specshield.policy.shape import headings_of, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.policy.undo import turning_motion
 from specshield.reasons.still_open import bounds_after, still_open
-from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body
-from specshield.rule.residual import all_of
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look
-from specshield.rule.worst import moved, worst_signals
 from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Not, Or, conjuncts
 from specshield.task import Task
@@ -94,7 +94,7 @@ class PlannerPolicy(Carded):
         return self.on_body(self._world.body, guess=True)
 
     def avoiding(self, barred: Floats) -> PlannerPolicy:
-        """The policy without barred motions [n, 6] (robot/barred.py)."""
+        """The policy without barred motions [n, 6] (caution/surprise/barred.py)."""
         return self._in(self._world._replace(barred=barred))
 
     def promptly(self) -> PlannerPolicy:

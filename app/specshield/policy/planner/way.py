@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from specshield.arrays import Floats, Ints
+from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import leaf
 from specshield.policy.planner.due_dates import Bounds, note, read_pose
 from specshield.policy.planner.fields import Fields
 from specshield.policy.planner.literals import PREDICATE, SIDE, PackedLiterals
-from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, step
 
 # The columns of `need`, for each literal: DUE, the step by which it has to hold once; BEGIN and UNTIL, the
@@ -27,7 +27,7 @@ class World(NamedTuple):
     field [L, 2]: the field that leads to each literal freely, and the one that keeps what has to hold for a
     while; -1 for none. band: how far the fields may err [steps]. pad: the motion that stays, or comes nearest
     to it; stands: whether it stays. cost: of one evaluation of the formula [about us]. barred [n, 6]: motions
-    that are taken to lead nowhere (robot/barred.py).
+    that are taken to lead nowhere (caution/surprise/barred.py).
     """
 
     body: Body

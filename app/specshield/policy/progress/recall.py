@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 from specshield.arrays import Floats, Int8s, Ints
+from specshield.caution.residual import again, all_of, left_over
 from specshield.compiled import kernel, leaf
 from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
-from specshield.rule.residual import again, all_of, left_over
 from specshield.stl import Formula
 
 

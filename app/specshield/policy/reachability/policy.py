@@ -14,6 +14,9 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Bools, Floats
+from specshield.caution.room import widened
+from specshield.caution.surprise.barred import NOTHING_BARRED, in_vain
+from specshield.caution.worst import apart, moved
 from specshield.compiled import Boxed, box
 from specshield.errors import MapError, PolicyError, SampleError
 from specshield.policy.card import Card, Carded, joined, make_card
@@ -37,12 +40,9 @@ from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, s
 from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import LATE, Guide, Tables
 from specshield.policy.shape import headings_of, side_of
-from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, calmest_motion, make_body
-from specshield.robot.room import widened
 from specshield.rule.values import signal_rows
 from specshield.rule.view import view_of
-from specshield.rule.worst import apart, moved
 from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
@@ -61,7 +61,7 @@ class ReachabilityPolicy(Carded):
     """Proposes what the tables (tables.py) lead to (search.py).
 
     narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py). wide: the tables for
-    ways with room beside them (robot/room.py), None for a robot that goes back.
+    ways with room beside them (caution/room.py), None for a robot that goes back.
     """
 
     settings: Settings
@@ -91,7 +91,7 @@ class ReachabilityPolicy(Carded):
         return policy._but(body, told=False, guess=guess)
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
-        """The policy without barred motions [n, 6] (robot/barred.py)."""
+        """The policy without barred motions [n, 6] (caution/surprise/barred.py)."""
         return self._but(self._body, barred=barred)
 
     def earlier(self, steps: int, wanted: Bools) -> ReachabilityPolicy:
@@ -117,7 +117,7 @@ class ReachabilityPolicy(Carded):
         return self._but(self._body, brief=True)
 
     def keeping_clear(self) -> ReachabilityPolicy:
-        """The policy for ways with room beside them (robot/room.py); itself where it has no such tables."""
+        """The policy for ways with room beside them (caution/room.py); itself where it has no such tables."""
         return self if self.wide is None else self._but(widened(self._body), tables=self.wide)
 
     def _but(self, body: Body, **changed: Any) -> ReachabilityPolicy:

@@ -56,7 +56,7 @@ class Tables(NamedTuple):
 
 class Guide(NamedTuple):
     """What leads a robot. wait: the motion that stands still, -1 where there is none. barred [n, 6]: motions
-    that led nowhere, and from where (robot/barred.py).
+    that led nowhere, and from where (caution/surprise/barred.py).
     """
 
     body: Body

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
+from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import inlined, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import SHORTEST_MOVE
@@ -33,7 +34,6 @@ from specshield.policy.reachability.tables import (
     score,
     slack,
 )
-from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import step
 
 # Chosen by hand; nothing measured.

@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.handover import explained
+from specshield.episode.handover import explained
 from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.service.sessions.packing import COLUMNS, full, pack_table, sparse, unpack_table
 from specshield.shield.decision import Decision

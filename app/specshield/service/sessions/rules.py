@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from specshield import handover
 from specshield.arrays import Floats
+from specshield.episode import handover
 from specshield.shield.decision import Carry
 
 MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
+from specshield import episode
 from specshield.arrays import Floats
+from specshield.episode.handover import check_main_task
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
-from specshield.handover import check_main_task
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
@@ -25,7 +26,6 @@ from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.record import Asked, StepRecord
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
-from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield
 
 F = TypeVar("F")

@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from specshield import __version__, handover
+from specshield import __version__, episode
 from specshield.arrays import Floats
+from specshield.caution.signals import any_signal
 from specshield.cores import cores
+from specshield.episode import handover
 from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
@@ -48,10 +50,8 @@ from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.store import Change, Limit, exists, no_more
-from specshield.shield import episode
 from specshield.shield.decision import USUAL_STEPS, Config, check_preferring
 from specshield.shield.preference import Preference
-from specshield.shield.signals import any_signal
 from specshield.world.learned import LearnedMap
 
 R = TypeVar("R")

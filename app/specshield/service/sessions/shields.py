@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from specshield import episode
 from specshield.arrays import Floats
 from specshield.lookahead.preferences import AHEADS, PROJECTION, prepare
 from specshield.robot.dynamics import make_body
@@ -21,7 +22,6 @@ from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.sessions import record, rules
 from specshield.service.sessions.session import Session
-from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 

@@ -8,9 +8,9 @@ import zlib
 import msgspec
 import numpy as np
 
+from specshield.caution.taught import HEAD, Taught
 from specshield.errors import StoreError
 from specshield.shield.decision import Carry
-from specshield.shield.taught import HEAD, Taught
 from specshield.world.learned import NONE, LearnedMap
 
 

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.episode.handover import check_signals
 from specshield.errors import SpecshieldError
-from specshield.handover import check_signals
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from specshield import __version__
+from specshield import __version__, episode
 from specshield.arrays import Floats
+from specshield.caution.signals import any_signal
 from specshield.errors import InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
@@ -23,9 +24,7 @@ from specshield.service.sessions.session import RACES, Session, check_last, cont
 from specshield.service.sessions.shields import Run, Shields
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
-from specshield.shield import episode
 from specshield.shield.decision import Config
-from specshield.shield.signals import any_signal
 
 
 class Switches:

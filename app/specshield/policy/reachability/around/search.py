@@ -17,6 +17,7 @@ import math
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints, copy_row
+from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
@@ -45,7 +46,6 @@ from specshield.policy.reachability.tables import (
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
 from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
 from specshield.policy.undo import IMPOSSIBLE, turning_motion
-from specshield.robot.barred import is_barred
 from specshield.robot.contact import overlap
 from specshield.robot.dynamics import around, longest_motions, motion_count, simulate, step, step_from
 
