@@ -30,6 +30,12 @@ CALLER = (
     "found = [outer, *(callee for place, callee in linking._callees.items() if 'inner' in place)]\n"
     "print(outer(1), sum(sum(kernel.stats.cache_hits.values()) for kernel in found))\n"
 )
+ANY = "from specshield.compiled import leaf\n\n@leaf\ndef first(pair):\n    return pair[0]\n"
+PAIR = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    left: int\n    right: int\n"
+WITH_PAIR = (
+    "from specshield.inner import first\nfrom specshield.{} import Pair\n\n"
+    "print(first(Pair(2, 3)), sum(first.stats.cache_hits.values()))\n"
+)
 
 
 @pytest.fixture
@@ -134,6 +140,17 @@ def test_a_kernel_is_compiled_anew_when_one_that_it_is_made_of_changes(package, 
     (package / "inner.py").write_text(INNER.format(5))
     assert run(package, kept) == (6, 0)
     assert len(list((kept / "specshield.outer").iterdir())) == 1  # the old ones are gone
+
+
+def test_a_kernel_that_was_kept_for_a_type_which_has_moved_is_compiled_anew(package, run, tmp_path):
+    kept = tmp_path / "kept"
+    (package / "inner.py").write_text(ANY)
+    for module in ("pairs", "moved"):
+        (package / f"{module}.py").write_text(PAIR)
+        (package / "outer.py").write_text(WITH_PAIR.format(module))
+        assert run(package, kept) == (2, 0)
+        assert run(package, kept) == (2, 1)
+        (package / f"{module}.py").unlink()
 
 
 def test_kernels_that_a_wheel_brings_are_taken_wherever_and_whenever_it_is_installed(package, run, tmp_path):

@@ -143,6 +143,12 @@ def _load_whole(compiled: Any) -> None:
             kernel = load(types, context)
         except _GoneError:
             return None
+        except (ImportError, AttributeError):  # another version kept it for a type that has moved since
+            try:
+                compiled._cache.flush()
+            except OSError:
+                compiled._cache.disable()
+            return None
         if kernel is None or kernel.signature.args != getattr(types, "args", types):
             return None  # two processes wrote the same file
         inherited = kernel.library._reload_init
