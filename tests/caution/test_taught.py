@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from specshield.caution import findings
 from specshield.caution.experience import FORMAT, Seen
 from specshield.caution.noise import Care
 from specshield.caution.surprise.barred import is_barred
@@ -20,7 +21,7 @@ from specshield.caution.surprise.contact import NEAR, Followed, contact_of
 from specshield.caution.surprise.doubt import recovered
 from specshield.caution.surprise.vain import barred_by
 from specshield.caution.taught import Taught, on_map, wary
-from specshield.episode import Carry, Config, algorithm, decide, make_shield
+from specshield.episode import Carry, Config, decide, make_shield
 from specshield.policy.planner.policy import Settings as Plan
 from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import Settings
@@ -519,7 +520,7 @@ def test_what_can_still_be_kept_is_kept_while_another_part_is_lost_but_not_yet_b
         assert len(judged.tried.rho) == len(judged.kept)
         return judged
 
-    monkeypatch.setattr(algorithm, "recovered", checked)
+    monkeypatch.setattr(findings, "recovered", checked)
     poses, carry, said = [(2.0, 0.5, math.pi)], None, []
     for t in range(37):
         decision = decide(shield, poses, None, True, carry=carry)

@@ -73,41 +73,20 @@ class Judged(NamedTuple):
 def judge(shield: Shield, now: Situation) -> Judged:
     """Tries the futures from x_t, and judges each motion by the best of its futures."""
     prefix, tail, care, violated = now.prefix, now.tail, now.care, now.status == "violated"
-    robot, asked, roomy = shield.task.robot, care.margin, care.room and not violated
-    hows = ["keeping_clear"] * roomy + ["promptly"] * bool(shield.config.uncertainty and not care.guess)
-    asks = ((each, adapted(each, how)) for how in hows for each in shield.proposers)
-    more = tuple(policy for each, policy in asks if policy is not each)
-    shield = replace(shield, proposers=(*shield.proposers, *more)) if more else shield
+    robot, roomy = shield.task.robot, care.room and not violated
     motions = len(robot.motions)
-    # Several guesses about the map may be tried in one decision, so each is tried without a margin first.
-    margins = (0.0,) if care.guess and not violated else (asked, 0.0)
-    tried = futures(prefix, shield.body, shield.proposers, tail, margins)
-    if asked not in margins and tried.rho.max() > SATISFIED_ABOVE:
-        tried = together(tried, futures(prefix, shield.body, shield.proposers, None, (asked,)))
-    kept, leaves, part, vain = tried.rho, tried.leaves, prefix, False
+    shield, tried = _tried(shield, now, roomy)
+    kept, leaves, part = tried.rho, tried.leaves, prefix
     if violated:
         tried, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried.poses)
-    best, left_out = best_of(tried.motions, kept, motions), np.zeros(motions, np.bool_)
-    if care.barred is not None:
-        others = _aside(shield, care.barred, prefix, tried, kept)
-        vain = others.max() <= SATISFIED_ABOVE
-        if not vain:
-            without_it = best_of(tried.motions, others, motions)
-            left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
-            kept, best = others, without_it
+    kept, vain, left_out = _without_barred(shield, care, prefix, tried, kept)
     follows, had = recovers(shield.config) and tail is not None and len(tail) == prefix.steps, None
     if roomy:
-        apart = _with_room(shield, prefix, tried, kept)
-        roomy = max(apart.tolist()) > SATISFIED_ABOVE
-        had = aim(shield, care, part, tried, apart, leaves, follows) if roomy else None
-        if had and had.slack < care.least // 2:  # room may cost up to half of the slack that is asked for
-            none = aim(shield, care, part, tried, kept, leaves, follows)
-            roomy, had = (True, had) if had.slack >= none.slack else (False, none)
-        kept = apart if roomy else kept
-        best = best_of(tried.motions, kept, motions)
-    feasible, lowered = _kept(best.robustness, asked)
-    values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
+        kept, roomy, had = _roomy(shield, care, prefix, tried, kept, follows)
+    best = best_of(tried.motions, kept, motions)
+    feasible, lowered = _kept(best.robustness, care.margin)
+    values, aimed = best.robustness, Aimed(best, feasible, care.margin, 0, lowered)
     if lowered or ((care.least or care.noise is not EXACT) and max(values.tolist()) > SATISFIED_ABOVE):
         aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
         most = aimed.slack or max(aimed.early.tolist(), default=0)
@@ -116,7 +95,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         if sooner and not violated:
             known, wanted, before = len(tried.rho), left | anew, None if anew else aimed
             for steps in sooner:
-                tried = _in_time(shield, prefix, tried, asked, steps, wanted)
+                tried = _in_time(shield, prefix, tried, care.margin, steps, wanted)
             if len(tried.rho) > known:
                 kept = tried.rho
                 if care.barred is not None and not vain:
@@ -125,16 +104,67 @@ def judge(shield: Shield, now: Situation) -> Judged:
                 aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, before)
                 values = best_of(tried.motions, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
-    some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
         tried = tried._replace(warnings=(*tried.warnings, *given_up(prefix)))
+    first = tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]
-    elif some and not feasible[first]:
+    elif True in feasible.tolist() and not feasible[first]:
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     return Judged(tried, part, kept, aimed, feasible, *by_action, completion, vain, left_out)
+
+
+def _tried(shield: Shield, now: Situation, roomy: bool) -> tuple[Shield, Futures]:
+    """The futures from x_t, also those with the margin that is asked for; and the shield with the policies
+    that were asked. roomy: whether ways with room are asked for too.
+    """
+    prefix, asked, violated = now.prefix, now.care.margin, now.status == "violated"
+    prompt = shield.config.uncertainty is not None and not now.care.guess
+    hows = ["keeping_clear"] * roomy + ["promptly"] * prompt
+    asks = ((each, adapted(each, how)) for how in hows for each in shield.proposers)
+    more = tuple(policy for each, policy in asks if policy is not each)
+    shield = replace(shield, proposers=(*shield.proposers, *more)) if more else shield
+    # Several guesses about the map may be tried in one decision, so each is tried without a margin first.
+    margins = (0.0,) if now.care.guess and not violated else (asked, 0.0)
+    tried = futures(prefix, shield.body, shield.proposers, now.tail, margins)
+    if asked not in margins and tried.rho.max() > SATISFIED_ABOVE:
+        tried = together(tried, futures(prefix, shield.body, shield.proposers, None, (asked,)))
+    return shield, tried
+
+
+def _without_barred(
+    shield: Shield, care: Care, prefix: Prefix, tried: Futures, kept: Floats
+) -> tuple[Floats, bool, Bools]:
+    """`kept` [N] without the futures that make a barred motion, unless all that keep the rule do; whether all
+    do; and `Judged.left_out` [M].
+    """
+    motions = len(shield.task.robot.motions)
+    if care.barred is None:
+        return kept, False, np.zeros(motions, np.bool_)
+    others = _aside(shield, care.barred, prefix, tried, kept)
+    if others.max() <= SATISFIED_ABOVE:
+        return kept, True, np.zeros(motions, np.bool_)
+    before, without_it = (best_of(tried.motions, each, motions).robustness for each in (kept, others))
+    return others, False, (before > SATISFIED_ABOVE) & (without_it <= SATISFIED_ABOVE)
+
+
+def _roomy(
+    shield: Shield, care: Care, prefix: Prefix, tried: Futures, kept: Floats, follows: bool
+) -> tuple[Floats, bool, Aimed | None]:
+    """`kept` [N] with -inf for the futures without room, unless room cannot be had or costs too much slack;
+    whether it can be had; and the margin and the slack, where they were computed. follows: see `aim`.
+    """
+    apart = _with_room(shield, prefix, tried, kept)
+    if max(apart.tolist()) <= SATISFIED_ABOVE:
+        return kept, False, None
+    had = aim(shield, care, prefix, tried, apart, tried.leaves, follows)
+    if had.slack < care.least // 2:  # room may cost up to half of the slack that is asked for
+        none = aim(shield, care, prefix, tried, kept, tried.leaves, follows)
+        if had.slack < none.slack:
+            return kept, False, none
+    return apart, True, had
 
 
 def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:

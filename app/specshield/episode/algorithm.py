@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.caution import judgement
 from specshield.caution.experience import learn, remember
-from specshield.caution.signals import judged_by_signals
-from specshield.caution.surprise.doubt import recovered, tried_again
+from specshield.caution.findings import findings
 from specshield.caution.surprise.slip import SAME_POSE, with_begun
-from specshield.caution.taught import doubtful, handed_on, on_map, teach, wary
+from specshield.caution.taught import handed_on, on_map, teach, wary
 from specshield.caution.threshold import chances, left_of, next_left
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
@@ -145,18 +144,11 @@ def decide(
         answer = unmodified(shield, log_prior)
     else:
         now = judgement.Situation(prefix, tail, spec_status, care)
-        shield, now, judged, withstands = judged_by_signals(shield, now)
-        believed = tried_again(told, taught, judged, now)
-        if believed is not None:
-            taught, (shield, now, judged, withstands) = believed
-            said = (*said, "no other way was left, so what was touched, or last seen long ago, is doubted")
-            touches = _look_around(shield.body, poses[-1], nexts)
-        prefix = now.prefix
-        doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
-        judged = recovered(told, shield, taught, judged, now)
-        judged = judgement.without(judged, shield, doubts, risky)
-        if judged.vain and judged.some:
-            said = (*said, "every way left has a motion that led nowhere from here before: it is tried again")
+        found = findings(told, shield, taught, now, nexts)
+        if found.shield.body is not shield.body:  # another map is believed
+            touches = _look_around(found.shield.body, poses[-1], nexts)
+        shield, taught, prefix, judged = found.shield, found.taught, found.now.prefix, found.judged
+        doubts, withstands, said = found.doubts, found.withstands, (*said, *found.said)
         body = shield.body if len(taught.map) else told.body  # if nothing was learned, the map is as told
         certified = certify(shield, body, judged.part if spec_status == "violated" else whole, judged.claim)
         said = (*said, *certified.warnings)
