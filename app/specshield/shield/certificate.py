@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Bytes, Floats, Ints
 from specshield.compiled import kernel
 from specshield.robot.dynamics import Body
 from specshield.shield.decision import Shield
@@ -69,37 +69,42 @@ def certify(shield: Shield, body: Body, prefix: Prefix, claim: Claim) -> Certifi
     rho, warnings = tried.rho, tried.warnings
     if tried.prefix is not prefix:  # a future that was given up has no poses to judge
         rho = np.where(rho > -np.inf, rho_of(prefix, tried.poses)[0], -np.inf)
-    holds = np.zeros(len(robot.motions), np.bool_)
-    if tried.body is body:
-        _hold(tried.motions, rho, claim.motions, claim.row, holds)
-    if holds.tolist() != claim.motions.tolist():
+    claimed = claim.motions if tried.body is body else np.zeros_like(claim.motions)
+    holds, feasible, rows = _hold(tried.motions, rho, claimed, claim.row, robot.motion_of)
+    held, content, n = holds.tolist(), rows.tobytes(), rows.shape[1]
+    if held != claim.motions.tolist():
         warnings = (*warnings, "not every action that seemed feasible has a future that keeps the rule")
     if shield.config.evaluation == "robustness":
-        best = best_of(tried.motions, rho, len(holds)).robustness
+        best = best_of(tried.motions, rho, len(held)).robustness
         values = np.minimum(values, np.where(robot.motion_of >= 0, best[robot.motion_of], -np.inf))
-    if not holds[robot.motion_of[completion]] and holds.any():
-        likely = np.where(holds & (claim.row >= 0), rho[claim.row], -np.inf)
-        completion = int(robot.representative[np.argmax(likely)])
-    feasible = (robot.motion_of >= 0) & holds[robot.motion_of]
-    witnesses = _witnesses_of(tried.motions, claim.row, holds)
+    if True in held and not held[robot.motion_of[completion]]:
+        completion = int(robot.representative[np.argmax(np.where(holds, rho[claim.row], -np.inf))])
+    witnesses = tuple([content[m * n : m * n + n] if ok else None for m, ok in enumerate(held)])
     return Certified(feasible, witnesses, values, claim.robustness, completion, claim.lowered, warnings)
 
 
 @kernel
-def _hold(motions: Ints, rho: Floats, claimed: Bools, row: Ints, holds: Bools) -> None:
-    """Writes into holds (M,) which of the claimed motions (M,) have a future that keeps the rule. motions
-    (N, T - t), rho (N,): of the futures; row (M,): which of them shall show it.
+def _hold(
+    motions: Ints, rho: Floats, claimed: Bools, row: Ints, motion_of: Ints
+) -> tuple[Bools, Bools, Bytes]:
+    """Which of the claimed motions (M,) have a future that keeps the rule; the actions (A,) that make such a
+    motion; and what follows these motions in their futures (M, T - t - 1).
+
+    motions (N, T - t), rho (N,): of the futures; row (M,): which of them shall show it. motion_of (A,): -1
+    for a terminal action.
     """
-    for m in range(claimed.shape[0]):
-        if claimed[m] and 0 <= row[m] < rho.shape[0]:
-            holds[m] = motions[row[m], 0] == m and rho[row[m]] > SATISFIED_ABOVE
-
-
-def _witnesses_of(motions: Ints, row: Ints, holds: Bools) -> Witnesses:
-    """`Certified.witnesses`, from the futures' motions [N, T - t]."""
-    rows = motions.astype(np.uint8).take(row, 0, mode="clip")
-    content, n = rows.tobytes(), rows.shape[1]
-    return tuple([content[m * n + 1 : (m + 1) * n] if ok else None for m, ok in enumerate(holds.tolist())])
+    count, n = claimed.shape[0], motions.shape[1] - 1
+    holds, feasible = np.zeros(count, np.bool_), np.zeros(motion_of.shape[0], np.bool_)
+    rows = np.empty((count, n), np.uint8)
+    for m in range(count):
+        f = row[m]
+        if claimed[m] and 0 <= f < rho.shape[0] and motions[f, 0] == m and rho[f] > SATISFIED_ABOVE:
+            holds[m] = True
+            for k in range(n):
+                rows[m, k] = motions[f, k + 1]
+    for a in range(feasible.shape[0]):
+        feasible[a] = motion_of[a] >= 0 and holds[motion_of[a]]
+    return holds, feasible, rows
 
 
 def as_actions(shield: Shield, witnesses: Witnesses, action: int) -> tuple[int, ...] | None:
