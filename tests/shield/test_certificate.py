@@ -67,8 +67,9 @@ def test_motions_that_are_claimed_without_a_future_that_keeps_the_rule_are_not_c
     ],
 )
 def test_a_motion_is_certified_by_a_future_of_its_own_alone(row):
-    _, feasible = certified(claim(row=np.array(row)))
+    found, feasible = certified(claim(row=np.array(row), completion=WAIT))
     assert feasible == {FORWARD}
+    assert found.completion == FORWARD
 
 
 def test_futures_on_another_map_certify_nothing():

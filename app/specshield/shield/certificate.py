@@ -78,7 +78,8 @@ def certify(shield: Shield, body: Body, prefix: Prefix, claim: Claim) -> Certifi
         best = best_of(tried.motions, rho, len(held)).robustness
         values = np.minimum(values, np.where(robot.motion_of >= 0, best[robot.motion_of], -np.inf))
     if True in held and not held[robot.motion_of[completion]]:
-        completion = int(robot.representative[np.argmax(np.where(holds, rho[claim.row], -np.inf))])
+        shown = np.where(holds, rho.take(claim.row, mode="clip"), -np.inf)
+        completion = int(robot.representative[np.argmax(shown)])
     witnesses = tuple([content[m * n : m * n + n] if ok else None for m, ok in enumerate(held)])
     return Certified(feasible, witnesses, values, claim.robustness, completion, claim.lowered, warnings)
 
