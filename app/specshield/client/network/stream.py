@@ -104,11 +104,14 @@ class Streams:
         }
 
     def _read(self, exchange: Exchange, message: bytes | str) -> Reply | Failure:
-        """The reply that a message holds; a Failure if it is no answer, or is about another step."""
+        """The reply that a message holds; a Failure if it is no answer, or is about another step. Raises
+        httpx.ReadTimeout if too little time is left to parse it.
+        """
         import msgpack
 
+        exchange.take(message if isinstance(message, bytes) else b"")
         try:
-            document = msgpack.unpackb(message) if isinstance(message, bytes) else None
+            document = msgpack.unpackb(exchange.content)
         except (ValueError, msgpack.exceptions.UnpackException):
             document = None
         if not isinstance(document, dict):
@@ -143,6 +146,8 @@ class SyncStreams(Streams):
             return reply
         except TimeoutError:
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except httpx.RequestError as error:
+            return exchange.failure(error)
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
         finally:
@@ -174,6 +179,8 @@ class AsyncStreams(Streams):
             return await asyncio.wait_for(self._asked(exchange, message), seconds)
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except httpx.RequestError as error:
+            return exchange.failure(error)
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
 
