@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 
-from specshield.drawing.avoided import avoided
+from specshield.drawing.rules import avoided
 from specshield.sim import picture
 from specshield.sim.campaign import each_done, robots, run
 from specshield.sim.demo import table
