@@ -104,7 +104,9 @@ def stepping(request):
     return run
 
 
-def test_steps_go_over_one_connection_in_messagepack(stepping):
+def test_steps_go_over_one_connection_in_messagepack(stepping, monkeypatch):
+    """To a server on this machine, for which a proxy would take itself."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
     server = Server()
     decisions = stepping(server, 5)
     assert [decision.t for decision in decisions] == [0, 1, 2, 3, 4]

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from specshield.client.network.bounded import in_thread
+from specshield.client.network.bounded import in_thread, is_direct
 from specshield.client.network.transport import STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
@@ -97,6 +97,7 @@ class Streams:
         return {
             "uri": base.rstrip("/") + exchange.request.path.removesuffix("/steps") + "/stream",
             "additional_headers": {} if key is None else {"Authorization": key},
+            "proxy": None if is_direct(self._http.base_url.host) else True,
             "compression": None,
             "ping_interval": None,
             "open_timeout": exchange.seconds,
