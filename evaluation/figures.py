@@ -15,8 +15,8 @@ from evaluation.colors import AVOID, BLUE, FAINT, GREY, INK, ORANGE, TARGET, TIN
 from evaluation.experiment import METHODS, split
 from evaluation.runs import Record
 from evaluation.statistics import MODES
-from specshield.drawing.avoided import is_avoided
 from specshield.drawing.outline import outlines
+from specshield.drawing.rules import is_avoided
 from specshield.sim.cases import Case
 from specshield.stl import robustness
 

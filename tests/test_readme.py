@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from specshield.sim import report
+from specshield.sim import demo
 from specshield.sim.campaign import Campaign
 from specshield.sim.cases import load_case
 from specshield.sim.episodes import Episode
@@ -59,7 +59,7 @@ def test_bring_your_own(tmp_path):
 def test_the_table_is_what_the_demo_prints():
     (printed,) = blocks("text")
     episode = Episode("case1", 0, True, (0.0, 0.0, 0.0), round_trip_ms=[0.0], server_ms=[0.0])
-    table = report.table([Campaign(load_case("case1"), [episode], [episode], 0)])
+    table = demo.table([Campaign(load_case("case1"), [episode], [episode], 0)])
     rows = [line[:26].rstrip() for line in table.splitlines()[2:]]
     assert [line[:26].rstrip() for line in printed.splitlines()[-len(rows) :]] == rows
     (kept,) = re.findall("^rule satisfied.*$", printed, re.MULTILINE)

@@ -202,11 +202,14 @@ def test_a_proxy_that_the_environment_names_is_used(use, monkeypatch):
         threading.Thread(target=server.serve_forever, daemon=True).start()
         monkeypatch.setenv("http_proxy", f"http://me:secret@127.0.0.1:{server.server_port}")
         assert use("http://robot.test", validate, timeout=10.0).horizon == 3
+        for here in ("127.0.0.1", "localhost"):  # which the proxy would take for itself
+            assert use(f"http://{here}:{server.server_port}", validate, timeout=10.0).horizon == 3
         monkeypatch.setenv("no_proxy", "robot.test")
         with pytest.raises(errors.TransportError):
             use("http://robot.test", validate)
         server.shutdown()
-    assert seen == [("http://robot.test/v1/specs/validate", "Basic bWU6c2VjcmV0")]
+    directly = [("/v1/specs/validate", None)] * 2
+    assert seen == [("http://robot.test/v1/specs/validate", "Basic bWU6c2VjcmV0"), *directly]
 
 
 def test_what_goes_over_the_wire(use):

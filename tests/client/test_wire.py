@@ -200,6 +200,10 @@ def test_content_is_bytes_a_text_or_a_file(tmp_path: Path):
         with pytest.raises(errors.InputError, match=r"\.pgm") as caught:
             wire.content(wrong, "image")
         assert caught.value.path == "image"
+    for none in (0.05, None, {"resolution": 0.05}):
+        with pytest.raises(errors.InputError, match="metadata cannot be sent as a file") as caught:
+            wire.content(none, "metadata")
+        assert caught.value.path == "metadata"
     for text, where in (("flat.pgm", "name"), ("resolution: 0.05\nimage: flat.pgm", "metadata")):
         assert wire.content(text, where) == text.encode()
 

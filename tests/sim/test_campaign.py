@@ -15,9 +15,10 @@ import numpy as np
 import psutil
 import pytest
 
-from specshield.drawing.avoided import avoided
-from specshield.sim import picture, report
+from specshield.drawing.rules import avoided
+from specshield.sim import picture
 from specshield.sim.campaign import each_done, robots, run
+from specshield.sim.demo import table
 from specshield.stl import parse
 from tests.oracles.judge import margin
 from tests.serving import HUNG, wait_for
@@ -155,7 +156,7 @@ def test_the_table_says_what_happened(campaign):
         "decisions": [str(decisions)],
         "starts refused": [f"{campaign.refused} of {RUNS + campaign.refused}"],
     }
-    lines = report.table([campaign, campaign]).splitlines()
+    lines = table([campaign, campaign]).splitlines()
     for name, cells in expected.items():
         (line,) = (line for line in lines if line.startswith(f"{name} "))
         assert re.split(" {2,}", line.removeprefix(name).strip()) == cells * 2
@@ -167,7 +168,7 @@ def test_a_pair_that_ended_at_once_is_counted(campaign):
         dataclasses.replace(campaign.shielded[0], main_done=True, ended_at=end) for end in (0, 7)
     )
     pairs = campaign._replace(shielded=[later, at_once, at_once], unshielded=[at_once] * 3)
-    assert re.search(r"^median extra steps +\+0$", report.table([pairs]), re.MULTILINE)  # of 7, 0 and 0
+    assert re.search(r"^median extra steps +\+0$", table([pairs]), re.MULTILINE)  # of 7, 0 and 0
 
 
 def test_a_broken_rule_is_noticed(campaign):

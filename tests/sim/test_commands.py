@@ -12,14 +12,16 @@ from specshield.sim.cases import load_case
 from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
 
 
-def specshield(*arguments, code=0):
-    done = run_specshield(*arguments)
+def specshield(*arguments, code=0, **environment):
+    done = run_specshield(*arguments, **environment)
     assert done.returncode == code, done.stderr
     return done
 
 
 def test_demo_prints_the_table_and_draws_each_case(tmp_path):
-    done = specshield("demo", "--runs", "1", "--seed", "4", "--out", str(tmp_path))
+    """Also where the environment names a proxy, which leads to no server of this machine."""
+    asked = ("demo", "--runs", "1", "--seed", "4", "--out", str(tmp_path))
+    done = specshield(*asked, http_proxy="http://127.0.0.1:9")
     assert "1 episodes a case, seed 4" in done.stdout
     assert "rule satisfied" in done.stdout
     assert done.stdout.count("1 of 1") >= 4

@@ -17,7 +17,7 @@ from specshield.client.core import D, Feed, Flow, More, T, Wait, page_of
 from specshield.client.models import Decision, Page
 from specshield.client.network import bounded
 from specshield.client.network.stream import AsyncStreams, packed
-from specshield.client.network.transport import STALE, Exchange, address, headers
+from specshield.client.network.transport import Exchange, address, headers
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.wire import Failure, Reply, Request, seconds_value
@@ -84,14 +84,13 @@ class AsyncShieldClient:
             self._streams.end(request)
         bounded.ENDS.set(exchange.ends)
         try:
-            reply = await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())
+            return await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except httpx.RequestError as error:
             return exchange.failure(error)
-        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
-    async def _exchanged(self, exchange: Exchange) -> Reply | None:
+    async def _exchanged(self, exchange: Exchange) -> Reply | Failure:
         async with contextlib.AsyncExitStack() as opened:
             response = await opened.enter_async_context(
                 self._http.stream(**exchange.arguments(self._timeout))
@@ -101,11 +100,11 @@ class AsyncShieldClient:
             if not listens:
                 async for chunk in response.aiter_bytes():
                     exchange.take(chunk)
-            reply = exchange.reply(response)
-            if reply is not None and listens:
-                reply = replace(reply, feed=Feed(response.aiter_bytes(), opened.pop_all().aclose))
-            elif reply is None and "network_stream" in response.extensions:
+            reply = exchange.reply(response.status_code, response.headers)
+            if isinstance(reply, Failure) and "network_stream" in response.extensions:
                 await response.extensions["network_stream"].aclose()  # what still comes is never read
+            elif isinstance(reply, Reply) and listens:
+                reply = replace(reply, feed=Feed(response.aiter_bytes(), opened.pop_all().aclose))
             return reply
 
     async def _more(self, more: More) -> Reply:

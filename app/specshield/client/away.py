@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from specshield.client.models import Decision, Pose
+from specshield.client.wiring import Move, between
 from specshield.errors import (
     HistoryConflict,
     InputError,
@@ -89,13 +91,13 @@ class Continuation:
 
     margin: float = 0.0  # [m]
     branches: tuple[Branch, ...] = ()
-    motions: dict[int, Pose] = field(default_factory=dict)
+    motions: dict[int, Move] = field(default_factory=dict)
 
     def learn(self, decision: Decision, pose: Pose) -> None:
         """Takes over the ways in the answer at `pose`: with `witnesses` one for each action."""
         for action, after in enumerate(decision.next_poses):
-            motion = _difference(pose, after)
-            if _length(motion) >= _length(self.motions.get(action, (0.0, 0.0, 0.0))):
+            motion = between(pose, after)
+            if _length(motion) >= _length(self.motions.get(action, (0j, 0.0))):
                 self.motions[action] = motion
         ways = {decision.execute: decision.witness}
         if decision.witnesses:
@@ -108,11 +110,11 @@ class Continuation:
         """The branch that goes on from `pose`, or a text that says why there is none."""
         if not self.branches:
             return "the service has certified no continuation"
-        branch = min(self.branches, key=lambda branch: _length(_difference(branch.pose, pose)))
-        x, y, turn = _difference(branch.pose, pose)
-        if math.hypot(x, y) > NEAR + self.margin or abs(turn) > TURNED:
+        branch = min(self.branches, key=lambda branch: _length(between(branch.pose, pose)))
+        off, turn = between(branch.pose, pose)
+        if abs(off) > NEAR + self.margin or abs(turn) > TURNED:
             return (
-                f"the robot is {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad from where the certified "
+                f"the robot is {abs(off):.2f} m and {abs(turn):.2f} rad from where the certified "
                 "continuation leads"
             )
         ended = "the certified continuation has ended: the rule's last step is reached"
@@ -126,17 +128,10 @@ class Continuation:
             self.branches = (Branch(_moved(way.pose, self.motions[way.plan[0]]), way.plan[1:]),)
 
 
-def _difference(a: Pose, b: Pose) -> Pose:
-    """The pose b in the frame of a: ahead [m], to the left [m], turn in [-pi, pi]."""
-    dx, dy, cos, sin = b[0] - a[0], b[1] - a[1], math.cos(a[2]), math.sin(a[2])
-    return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(b[2] - a[2], 2.0 * math.pi)
+def _moved(pose: Pose, motion: Move) -> Pose:
+    end = complex(pose[0], pose[1]) + motion[0] * cmath.exp(1j * pose[2])
+    return end.real, end.imag, math.remainder(pose[2] + motion[1], math.tau)
 
 
-def _moved(pose: Pose, motion: Pose) -> Pose:
-    cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    x, y = pose[0] + cos * motion[0] - sin * motion[1], pose[1] + sin * motion[0] + cos * motion[1]
-    return x, y, math.remainder(pose[2] + motion[2], 2.0 * math.pi)
-
-
-def _length(motion: Pose) -> float:
-    return math.hypot(motion[0], motion[1]) + abs(motion[2])
+def _length(motion: Move) -> float:
+    return abs(motion[0]) + abs(motion[1])

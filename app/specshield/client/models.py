@@ -7,7 +7,7 @@ ignored, so a newer server may add some.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, Literal, TypedDict, TypeVar
 
 from specshield.errors import InputError, ServerError, SpecshieldError
@@ -305,9 +305,11 @@ def execute_of(body: Mapping[str, Any], terminal: Sequence[int], over: bool) -> 
 
 
 def decision_of(
-    body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
+    body: Mapping[str, Any], rule: Mapping[str, Any], over: bool, timings: Mapping[str, float]
 ) -> Decision:
-    """The decision that an answer holds (the contract's names). over: whether the main task is over."""
+    """The decision that an answer holds (the contract's names). rule: with the `actions` and
+    `terminal_actions` for which it was made. over: whether the main task is over.
+    """
     residual, told = body.get("residual"), body.get("explanations")
     explained = [None if why is None else build(Explanation, why) for why in told or ()]
     return build(
@@ -316,15 +318,7 @@ def decision_of(
         residual=None if residual is None else build(Residual, residual),
         explanations=None if told is None else tuple(explained),
         timings=timings,
-        execute=execute_of(body, info.terminal_actions, over),
-        action_names=info.actions,
+        execute=execute_of(body, rule["terminal_actions"], over),
+        action_names=tuple(rule["actions"]),
         source="service",
     )
-
-
-def under(info: SessionInfo, rules: Sequence[Mapping[str, Any]], t: int) -> SessionInfo:
-    """`info` with the actions of the robot for which step t was decided."""
-    rule = next((rule for rule in reversed(rules) if rule["from"] <= t), None)
-    if rule is None:
-        return info
-    return replace(info, actions=tuple(rule["actions"]), terminal_actions=tuple(rule["terminal_actions"]))

@@ -22,19 +22,20 @@ if TYPE_CHECKING:
     from specshield.client.models import Beginning, Decision, LocalDecision
     from specshield.client.sync import Session, ShieldClient
 
-    T_co = TypeVar("T_co", covariant=True)
+    S_co = TypeVar("S_co", covariant=True)
+    A_co = TypeVar("A_co", covariant=True)
     Sync: TypeAlias = "Resource[ShieldClient]"
     Async: TypeAlias = "Resource[AsyncShieldClient]"
     Blocking: TypeAlias = "ShieldClient | Session[Any] | Sync"
     Awaiting: TypeAlias = "AsyncShieldClient | AsyncSession[Any] | Async"
 
-    class Method(Protocol[P, T_co]):
-        """For type checkers: a method that returns T, or in an asyncio client an awaitable of T."""
+    class Method(Protocol[P, S_co, A_co]):
+        """For type checkers: a method that returns one thing, and in an asyncio client another."""
 
         @overload
-        def __get__(self, of: Blocking, owner: Any) -> Callable[P, T_co]: ...
+        def __get__(self, of: Blocking, owner: Any) -> Callable[P, S_co]: ...
         @overload
-        def __get__(self, of: Awaiting, owner: Any) -> Callable[P, Coroutine[Any, Any, T_co]]: ...
+        def __get__(self, of: Awaiting, owner: Any) -> Callable[P, A_co]: ...
 
     class Deciding(Protocol[P]):
         """A method that returns what the steps of its session return."""
@@ -43,14 +44,6 @@ if TYPE_CHECKING:
         def __get__(self, of: Session[D], owner: Any) -> Callable[P, D]: ...
         @overload
         def __get__(self, of: AsyncSession[D], owner: Any) -> Callable[P, Coroutine[Any, Any, D]]: ...
-
-    class Listing(Protocol[T_co]):
-        """A method that returns an iterator over all items."""
-
-        @overload
-        def __get__(self, of: Sync, owner: Any) -> Callable[[], Iterator[T_co]]: ...
-        @overload
-        def __get__(self, of: Async, owner: Any) -> Callable[[], AsyncIterator[T_co]]: ...
 
 
 class Resource(Generic[C]):
@@ -63,24 +56,24 @@ class Resource(Generic[C]):
         return self._client._run(flow)
 
 
-def performing(flow: Callable[P, Flow[T]]) -> Method[P, T]:
+def performing(flow: Callable[P, Flow[T]]) -> Method[P, T, Coroutine[Any, Any, T]]:
     """A method of a client, or of one of its resources, that makes this call."""
 
     @looks_like(flow)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
         return self._run(flow(*args, **kwargs))
 
-    return cast("Method[P, T]", method)
+    return cast("Method[P, T, Coroutine[Any, Any, T]]", method)
 
 
-def stepping(flow: Callable[Concatenate[Any, P], Flow[T]]) -> Method[P, T]:
+def stepping(flow: Callable[Concatenate[Any, P], Flow[T]]) -> Method[P, T, Coroutine[Any, Any, T]]:
     """A method of a session that makes this call, which is itself a method of `SessionState`."""
 
     @looks_like(flow)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
         return self._run(flow(self, *args, **kwargs))
 
-    return cast("Method[P, T]", method)
+    return cast("Method[P, T, Coroutine[Any, Any, T]]", method)
 
 
 def deciding(flow: Callable[Concatenate[Any, P], Flow[Any]]) -> Deciding[P]:
@@ -88,13 +81,13 @@ def deciding(flow: Callable[Concatenate[Any, P], Flow[Any]]) -> Deciding[P]:
     return cast("Deciding[P]", stepping(flow))
 
 
-def listing(cls: type[T], resource: str) -> Listing[T]:
+def listing(cls: type[T], resource: str) -> Method[[], Iterator[T], AsyncIterator[T]]:
     def method(self: Any) -> Any:
         """All of them, in the order of the server's pages."""
         return self._client._listed(cls, resource)
 
     method.__name__ = "list"
-    return cast("Listing[T]", method)
+    return cast("Method[[], Iterator[T], AsyncIterator[T]]", method)
 
 
 def opening(flow: Callable[..., Flow[SessionInfo]]) -> Any:

@@ -26,7 +26,6 @@ from specshield.client.models import (
     Verdict,
     build,
     decision_of,
-    under,
 )
 from specshield.client.resources import deciding, stepping
 from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
@@ -77,8 +76,12 @@ class SessionState:
 
     def rule_at(self, t: int) -> str:
         """The rule that decides step t, as far as this object and its `events` know."""
-        begun = [rule["formula"] for rule in self._heard if rule["from"] <= t]
-        return str(begun[-1] if begun else self.info.spec["formula"])
+        return str(self._rule(t)["formula"])
+
+    def _rule(self, t: int) -> Mapping[str, Any]:
+        """The rule that decides step t, by the contract's names; the session's only one if it is not told."""
+        only = {**vars(self.info), "formula": self.info.spec["formula"]}
+        return next((rule for rule in reversed(self._heard) if rule["from"] <= t), only)
 
     @property
     def unsent(self) -> dict[int, Pose]:
@@ -202,7 +205,7 @@ class SessionState:
     def _decided(self, x_t: Pose | None, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], self._with(x_t)
         reply = yield from self._send("steps", poses, t, body, tries)
-        decision = decision_of(wire.json_object(reply), self.info, over, wire.timings(reply))
+        decision = decision_of(wire.json_object(reply), vars(self.info), over, wire.timings(reply))
         self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
         self.spec_status = decision.spec_status
         ends = own and decision.action in self.info.terminal_actions
@@ -220,7 +223,7 @@ class SessionState:
         for item in (yield from self._trajectory()) if self.t else ():
             self._continuation.branches = ()
             if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
-                decision = decision_of(item.decision, self.info, self.info.main_task_done, {})
+                decision = decision_of(item.decision, vars(self.info), self.info.main_task_done, {})
                 self._continuation.learn(decision, item.pose)
 
     def _switch(
@@ -282,8 +285,7 @@ class SessionState:
 
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session is finished exactly if its main task is over.
-            then = under(self.info, self._heard, answer.get("t", 0))
-            return decision_of(answer, then, bool(answer.get("finished")), {})
+            return decision_of(answer, self._rule(answer.get("t", 0)), bool(answer.get("finished")), {})
 
         return Events(self.id, self.t - 1 if after is None else after, decided, switched)
 

@@ -16,7 +16,7 @@ from specshield.client.core import D, Feed, Flow, More, T, Wait, page_of
 from specshield.client.models import Decision, Page
 from specshield.client.network import bounded
 from specshield.client.network.stream import SyncStreams, packed
-from specshield.client.network.transport import STALE, Exchange, address, headers
+from specshield.client.network.transport import Exchange, address, headers
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.wire import Failure, Reply, Request, seconds_value
@@ -97,16 +97,16 @@ class ShieldClient:
                 listens = request.listens and response.status_code == 200
                 for chunk in () if listens else response.iter_bytes():
                     exchange.take(chunk)
-                reply = exchange.reply(response)
-                if reply is not None and listens:
-                    return replace(reply, feed=Feed(response.iter_bytes(), opened.pop_all().close))
-                if reply is None and "network_stream" in response.extensions:
+                reply = exchange.reply(response.status_code, response.headers)
+                if isinstance(reply, Failure) and "network_stream" in response.extensions:
                     response.extensions["network_stream"].close()  # what still comes is never read
+                elif isinstance(reply, Reply) and listens:
+                    return replace(reply, feed=Feed(response.iter_bytes(), opened.pop_all().close))
+                return reply
         except httpx.RequestError as error:
             return exchange.failure(error)
         finally:
             bounded.ENDS.reset(token)
-        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     def _more(self, more: More) -> Reply:
         token = bounded.ENDS.set(more.ends)

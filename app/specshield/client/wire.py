@@ -142,7 +142,7 @@ def _listed(value: Any) -> Any:
 _json = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=_listed).encode
 
 
-def content(source: Content, where: str) -> bytes:
+def content(source: object, where: str) -> bytes:
     """The bytes of a file (a path object) or a text, or the given bytes. Raises InputError, also for a text
     that is the name of a file.
     """
@@ -154,6 +154,9 @@ def content(source: Content, where: str) -> bytes:
             raise InputError(told, path=where, got=str(source), expected=expected) from error
     if isinstance(source, str) and where != "name" and source.endswith(FILES) and "\n" not in source:
         told, expected = "this text is the name of a file, not its content", f"pathlib.Path({source!r})"
+        raise InputError(told, path=where, got=source, expected=expected)
+    if not isinstance(source, bytes | str):
+        told, expected = f"{where} cannot be sent as a file", "bytes, a text, or the path object of a file"
         raise InputError(told, path=where, got=source, expected=expected)
     return source.encode() if isinstance(source, str) else source
 

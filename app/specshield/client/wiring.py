@@ -30,19 +30,19 @@ WIDER = "the robot's turns are {:.2g} times as wide as its actions say; theta an
 log = logging.getLogger("specshield")
 
 
+Move = tuple[complex, float]  # from the robot before it: forward + left i [m], a turn to the left [rad]
+
+
 class Motion(NamedTuple):
-    """A step by which the robot was to move, in the frame of the robot before it: forward [m] + left [m] i,
-    and a turn to the left [rad]. told: by the action that was executed. leads: where each action leads.
+    """A step by which the robot was to move. told: by the action that was executed. found: by the poses.
+    leads: where each action leads.
     """
 
     action: int
-    told: tuple[complex, float]
-    found: tuple[complex, float]
+    told: Move
+    found: Move
     before: Pose
     leads: tuple[Pose, ...]
-
-
-Mistake = Callable[[int], tuple[complex, float] | None]  # what it makes of motion i, None if it does not say
 
 
 class Wiring:
@@ -72,13 +72,13 @@ class Wiring:
             log.warning("session %s: %s", self._session, wrong)
 
 
-def between(before: Pose, after: Pose) -> tuple[complex, float]:
-    """The motion between two poses in the frame of the first: forward + left i [m], a turn left [rad]."""
+def between(before: Pose, after: Pose) -> Move:
+    """The motion between two poses."""
     way = complex(after[0] - before[0], after[1] - before[1]) * cmath.exp(-1j * before[2])
     return way, math.remainder(after[2] - before[2], math.tau)
 
 
-def alike(one: tuple[complex, float], other: tuple[complex, float]) -> bool:
+def alike(one: Move, other: Move) -> bool:
     """Whether the first motion may be the second, with noise."""
     turned = abs(math.remainder(one[1] - other[1], math.tau))
     near = abs(one[0] - other[0]) <= FAR + PART * abs(other[0])
@@ -93,9 +93,9 @@ def diagnosed(motions: Sequence[Motion], names: Sequence[str]) -> str | None:
     if kept.count(False) < ENOUGH:
         return None
     best, words = ENOUGH - 1, None
-    for told, mistake in mistakes(motions, names):
-        made = [mistake(i) for i in range(len(motions))]
-        explains = [each is not None and alike(motions[i].found, each) for i, each in enumerate(made)]
+    for told, made in mistakes(motions, names):
+        both = zip(motions, made, strict=True)
+        explains = [move is not None and alike(each.found, move) for each, move in both]
         only = sum(yes and not was for yes, was in zip(explains, kept, strict=True))
         against = sum(was and not yes for yes, was in zip(explains, kept, strict=True))
         if only > best and only >= 0.75 * kept.count(False) and 8 * against <= only:
@@ -118,71 +118,67 @@ def scaled(motions: Sequence[Motion]) -> str | None:
     return None
 
 
-def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[str, Mistake]]:
-    """The mistakes that are looked for, in words, each with what it makes of the motions."""
+def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[str, list[Move | None]]]:
+    """The mistakes that are looked for, in words, each with what it makes of the motions: None of a motion of
+    which it says nothing.
+    """
+    told, headings = [each.told for each in motions], [each.before[2] for each in motions]
 
-    def changed(way: Callable[[Motion], complex], turn: float = 1.0) -> Mistake:
-        return lambda i: (way(motions[i]), turn * motions[i].told[1])
+    def strides_as(change: Callable[[complex], complex]) -> list[Move | None]:
+        return [(change(way), turn) for way, turn in told]
 
-    def over(each: Motion, mirrored: Callable[[complex], complex]) -> complex:
-        """The stride with its direction on the map mirrored."""
-        on_map = cmath.exp(1j * each.before[2])
-        return mirrored(each.told[0] * on_map) / on_map
+    def mirrored(mirror: Callable[[complex], complex]) -> list[Move | None]:
+        """The strides with their directions on the map mirrored."""
+        on_map = [cmath.exp(1j * theta) for theta in headings]
+        return [(mirror(way * on) / on, turn) for (way, turn), on in zip(told, on_map, strict=True)]
 
     yield (
         "the poses do not change: send the robot's new pose at each step; or something holds the robot",
-        lambda i: (0j, 0.0),
+        [(0j, 0.0)] * len(motions),
     )
     yield (
         "the poses are a step old: each shows what the motion before the last one did; send the pose "
         "once the motion has ended",
-        lambda i: motions[i - 1].told if i else None,
+        [None, *told[:-1]],
     )
     yield (
         "the robot turns the other way: theta and `rotate` grow counter-clockwise, on a map whose y axis "
         "points up; or its actions for left and right are exchanged",
-        changed(lambda each: each.told[0], -1.0),
+        [(way, -turn) for way, turn in told],
     )
-    yield "the robot moves backwards where it should move forward", changed(lambda each: -each.told[0])
+    yield "the robot moves backwards where it should move forward", strides_as(lambda way: -way)
     yield (
         "theta is in degrees, and should be in radians",
-        lambda i: (
-            motions[i].told[0] * cmath.rect(1.0, math.radians(theta := motions[i].before[2]) - theta),
-            math.remainder(math.degrees(motions[i].told[1]), math.tau),
-        ),
+        [
+            (way * cmath.rect(1.0, math.radians(theta) - theta), math.remainder(math.degrees(turn), math.tau))
+            for (way, turn), theta in zip(told, headings, strict=True)
+        ],
     )
-    yield (
-        "the y axis of the poses points the other way than that of the map",
-        changed(lambda each: over(each, complex.conjugate)),
-    )
-    yield (
-        "x and y of the poses are exchanged",
-        changed(lambda each: over(each, lambda way: 1j * way.conjugate())),
-    )
+    yield "the y axis of the poses points the other way than that of the map", mirrored(complex.conjugate)
+    yield "x and y of the poses are exchanged", mirrored(lambda way: 1j * way.conjugate())
     strides = [each for each in motions if min(abs(each.told[0]), abs(each.found[0])) > FAR]
     if strides:
         aside = cmath.phase(sum(each.found[0] / each.told[0] / abs(each.found[0]) for each in strides))
         where = f"{abs(math.degrees(aside)):.0f} degrees to the {'left' if aside > 0 else 'right'}"
         yield (
             f"the robot moves {where} of its heading: theta is 0 where it looks along the map's x axis",
-            changed(lambda each: each.told[0] * cmath.exp(1j * aside)),
+            strides_as(lambda way: way * cmath.exp(1j * aside)),
         )
         longer = _middle(abs(each.found[0]) / abs(each.told[0]) for each in strides)
-        yield (LONGER.format(longer), changed(lambda each: longer * each.told[0]))
+        yield LONGER.format(longer), strides_as(lambda way: longer * way)
     turns = [each for each in motions if abs(each.told[1]) > TURNED]
     if turns:
         wider = _middle(each.found[1] / each.told[1] for each in turns)
-        yield (WIDER.format(wider), changed(lambda each: each.told[0], wider))
+        yield WIDER.format(wider), [(way, wider * turn) for way, turn in told]
     done = {action: _done(motions, action) for action in {each.action for each in motions}}
     exchanged = [
         f"{names[a]!r} does what {names[b]!r} should do" for a, b in done.items() if b not in (a, None)
     ]
     if names and exchanged:
+        like = [(each, done[each.action]) for each in motions]
         yield (
             f"the actions have another order: {', and '.join(exchanged)}",
-            lambda i: (
-                None if (b := done[(was := motions[i]).action]) is None else between(was.before, was.leads[b])
-            ),
+            [None if b is None else between(each.before, each.leads[b]) for each, b in like],
         )
 
 

@@ -194,13 +194,15 @@ def _port(port: int) -> Iterator[Finding]:
 def _server(url: str) -> Iterator[Finding]:
     import httpx
 
+    from specshield.client.network.bounded import is_direct
     from specshield.client.network.transport import address
 
-    began, at = time.time(), str(address(url)).rstrip("/")
+    server, began = address(url), time.time()
+    at, proxies = str(server).rstrip("/"), not is_direct(server.host)
     elsewhere = "specshield serve, or another --url"
     try:
-        ready = httpx.get(f"{at}/readyz", timeout=10.0)
-        told = httpx.get(f"{at}/openapi.json", timeout=10.0)
+        ready = httpx.get(f"{at}/readyz", timeout=10.0, trust_env=proxies)
+        told = httpx.get(f"{at}/openapi.json", timeout=10.0, trust_env=proxies)
     except httpx.HTTPError as error:
         yield Finding("wrong", f"no server answers at {url}: {error}", elsewhere)
         return

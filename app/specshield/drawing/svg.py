@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 
 from specshield.arrays import Floats
-from specshield.drawing.avoided import is_avoided
 from specshield.drawing.outline import outlines
+from specshield.drawing.rules import is_avoided
 from specshield.task import Task
 from specshield.world.learned import NONE, LearnedMap
 from specshield.world.regions import Circle, Region, Union

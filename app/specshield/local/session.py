@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -291,13 +291,7 @@ class LocalSession:
 
     def _told(self, t: int) -> Mapping[str, Any] | None:
         decision = self._decisions.get(t)
-        if decision is None:
-            return None
-        answer = {name: value for name, value in _told(decision).items() if name not in OWN}
-        answer["residual"] = None if decision.residual is None else dict(vars(decision.residual))
-        if decision.explanations is not None:
-            answer["explanations"] = [why and _told(why) for why in decision.explanations]
-        return answer
+        return None if decision is None else asdict(decision, dict_factory=_contract)
 
 
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:
@@ -316,6 +310,6 @@ def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool,
     return Decision(**values, execute=execute, action_names=info.actions)
 
 
-def _told(made: Decision | Explanation) -> dict[str, Any]:
-    """The fields without those that the contract leaves out."""
-    return {name: value for name, value in vars(made).items() if value is not None or name not in ASKED}
+def _contract(members: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The fields of an object of the SDK, without those that the contract does not have or leaves out."""
+    return {n: value for n, value in members if n not in OWN and (value is not None or n not in ASKED)}

@@ -146,7 +146,8 @@ class _Ahead(NamedTuple):
     ) -> tuple[str | None, list[Need]]:
         """The result of `refuted`: why from none of these poses all goals can be met in time."""
         # apart: the fewest steps from a place where one goal is met to one where the other is
-        apart = [[self._steps(float(b.far[a.where].min())) for b in self.goals] for a in self.goals]
+        far = np.array([[b.far[a.where].min() for b in self.goals] for a in self.goals])
+        apart = self.ground.steps(far).tolist()
         steps = np.column_stack(
             [np.empty((len(poses), 0)), *(self._nearest(goal, poses) for goal in self.goals)]
         )
@@ -177,13 +178,7 @@ class _Ahead(NamedTuple):
         the squares on both sides.
         """
         moved = [poses + np.array([dx, dy, 0.0]) for dx in (-EDGE, EDGE) for dy in (-EDGE, EDGE)]
-        ways = np.min([goal.far[self.ground.squares(each)] for each in moved], axis=0)
-        return np.array([self._steps(way) for way in ways.tolist()])
-
-    def _steps(self, way: float) -> float:
-        if way <= 0.0 or way == math.inf:
-            return way
-        return float(math.ceil(way / self.ground.travel - 1e-9)) if self.ground.travel > 0.0 else math.inf
+        return self.ground.steps(np.min([goal.far[self.ground.squares(each)] for each in moved], axis=0))
 
     def _in_some_order(self, met: int, first: Floats, apart: Sequence[Sequence[float]], step: int) -> bool:
         """Whether the goals that are not met yet can be, one after the other (Held and Karp, 1962)."""

@@ -106,6 +106,12 @@ class Ground:
         found: Floats = _ways(goal & free, free) * (self.side / LONGER) - math.sqrt(2.0) * self.side
         return np.maximum(found, 0.0)
 
+    def steps(self, ways: Floats) -> Floats:
+        """The fewest steps that ways of these lengths [m] take, of any shape."""
+        if self.travel > 0.0:
+            return np.ceil(ways / self.travel - 1e-9)
+        return np.where(ways > 0.0, np.inf, 0.0)
+
 
 def make_ground(task: Task, body: Body, values: dict[str, float]) -> Ground:
     """The floor of the body's map. values: what the signals are held at."""

@@ -153,7 +153,7 @@ def _best(
     at = ground.squares(poses)
     spare, hopeless = np.full(len(poses), np.inf), np.zeros(len(poses), np.bool_)
     for k, goal in enumerate(goals):
-        ahead = np.ceil(goal.far[at] / ground.travel - 1e-9) if ground.travel > 0.0 else goal.far[at]
+        ahead = ground.steps(goal.far[at])
         ahead = np.where(run[:, k] > 0, 1 - run[:, k], ahead)  # a goal that is being met was begun in time
         is_open = met >> k & 1 == 0
         hopeless |= is_open & (step + ahead > goal.due)

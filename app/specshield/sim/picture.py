@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from specshield.drawing.avoided import avoided
+from specshield.drawing.rules import avoided
 from specshield.drawing.svg import Plan
 from specshield.policy.progress.obligations import obligations
 from specshield.sim.cases import Case

@@ -85,7 +85,8 @@ def _wait_until_ready(
     status = 0
     while server.poll() is None and status != 500:
         try:
-            answer = httpx.get(f"{url}/readyz", timeout=20.0, verify=False)  # plain HTTP: no certificates
+            # Plain HTTP on this machine: no certificates, no proxy.
+            answer = httpx.get(f"{url}/readyz", timeout=20.0, verify=False, trust_env=False)
         except httpx.TransportError:
             time.sleep(0.05)
             continue

@@ -20,7 +20,7 @@ from websockets.sync.server import serve
 from specshield import errors
 from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient
 from specshield.client.models import build
-from specshield.client.network import stream
+from specshield.client.network import stream, transport
 from specshield.client.network.stream import leave
 from tests.serving import wait_for
 
@@ -104,7 +104,9 @@ def stepping(request):
     return run
 
 
-def test_steps_go_over_one_connection_in_messagepack(stepping):
+def test_steps_go_over_one_connection_in_messagepack(stepping, monkeypatch):
+    """To a server on this machine, for which a proxy would take itself."""
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
     server = Server()
     decisions = stepping(server, 5)
     assert [decision.t for decision in decisions] == [0, 1, 2, 3, 4]
@@ -188,6 +190,14 @@ def test_a_server_that_says_nothing_is_left_at_the_deadline(stepping):
     with pytest.raises(errors.TransportTimeout):
         stepping(Server("mute"), timeout=600.0, deadline=0.2)
     assert time.monotonic() - began < 20.0
+
+
+def test_an_answer_that_could_not_be_read_in_time_is_none(stepping, monkeypatch):
+    monkeypatch.setattr(transport, "UNDERSTANDING", 60.0)  # [s] to parse a byte
+    server = Server()
+    with pytest.raises(errors.TransportTimeout) as caught:
+        stepping(server, timeout=20.0)
+    assert len(server.paths) == len(server.messages) == caught.value.details["tries"] > 1
 
 
 def test_problems_arrive_as_their_errors(stepping):

@@ -150,6 +150,16 @@ def in_thread(
     return given
 
 
+def is_direct(host: str) -> bool:
+    """Whether no proxy leads to a host: it is this machine, or the environment excepts it. What a proxy takes
+    for 127.0.0.1 is itself.
+    """
+    here = host == "localhost"
+    with contextlib.suppress(ValueError):
+        here = ip_address(host).is_loopback
+    return here or bool(proxy_bypass(host))
+
+
 class AsyncStream(_Around, httpcore.AsyncNetworkStream):
     """One connection for asyncio. Only the size of each read is bounded: a late try is cancelled."""
 
@@ -233,7 +243,7 @@ def _proxy(url: httpx.URL) -> dict[str, Any]:
     """The arguments of httpcore's proxy for this URL; {} if the environment names no proxy for it."""
     proxies = getproxies()
     named = proxies.get(url.scheme) or proxies.get("all")
-    if not named or proxy_bypass(url.host):
+    if not named or is_direct(url.host):
         return {}
     proxy = httpx.Proxy(named if "://" in named else f"http://{named}")
     at = proxy.url

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
-from specshield.client.network.bounded import in_thread
+from specshield.client.network.bounded import in_thread, is_direct
 from specshield.client.network.transport import STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
@@ -84,9 +84,9 @@ class Streams:
             steps = request.path.removesuffix("/close") + "/steps"
             self._leave(self._open.pop((self._here(), steps), None))
 
-    def _keep(self, connection: Any, path: str, reply: Reply | None) -> None:
+    def _keep(self, connection: Any, path: str, reply: Reply | Failure | None) -> None:
         """Keeps a connection for the next step; closes it without an answer, or if the session is over."""
-        over = reply is None or reply.parsed.get("finished") or self._http.is_closed
+        over = not isinstance(reply, Reply) or reply.parsed.get("finished") or self._http.is_closed
         if over or self._open.setdefault((self._here(), path), connection) is not connection:
             self._leave(connection)
 
@@ -97,24 +97,28 @@ class Streams:
         return {
             "uri": base.rstrip("/") + exchange.request.path.removesuffix("/steps") + "/stream",
             "additional_headers": {} if key is None else {"Authorization": key},
+            "proxy": None if is_direct(self._http.base_url.host) else True,
             "compression": None,
             "ping_interval": None,
             "open_timeout": exchange.seconds,
             "max_size": LONGEST,
         }
 
-    def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
-        """The reply that a message holds; None if it is no answer, or is about another step."""
+    def _read(self, exchange: Exchange, message: bytes | str) -> Reply | Failure:
+        """The reply that a message holds; a Failure if it is no answer, or is about another step. Raises
+        httpx.ReadTimeout if too little time is left to parse it.
+        """
         import msgpack
 
+        exchange.take(message if isinstance(message, bytes) else b"")
         try:
-            document = msgpack.unpackb(message) if isinstance(message, bytes) else None
+            document = msgpack.unpackb(exchange.content)
         except (ValueError, msgpack.exceptions.UnpackException):
             document = None
         if not isinstance(document, dict):
-            return None
+            return exchange.failure(httpx.ReadError(STALE))
         status = document.get("status", 200) if "type" in document else 200
-        return exchange.streamed(status, PROBLEM if status != 200 else {}, document)
+        return exchange.reply(status, PROBLEM if status != 200 else {}, document)
 
 
 def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
@@ -122,8 +126,8 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
     answer = getattr(error, "response", None)
     if answer is None:
         return exchange.failure(httpx.ReadError(str(error)))
-    refusal = httpx.Response(answer.status_code, headers=dict(answer.headers.raw_items()))
-    return exchange.told(refusal, bytes(answer.body or b""))
+    exchange.content += answer.body or b""
+    return exchange.reply(answer.status_code, dict(answer.headers.raw_items()))
 
 
 class SyncStreams(Streams):
@@ -140,13 +144,15 @@ class SyncStreams(Streams):
             connection = connection or self._connected(exchange)
             connection.send(message)
             reply = self._read(exchange, connection.recv(max(exchange.ends - time.monotonic(), 0.0)))
+            return reply
         except TimeoutError:
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except httpx.RequestError as error:
+            return exchange.failure(error)
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
         finally:
             self._keep(connection, path, reply)
-        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     def _connected(self, exchange: Exchange) -> Socket:
         """Connects in a thread, since looking up a name takes no time limit."""
@@ -171,14 +177,15 @@ class AsyncStreams(Streams):
 
         try:
             seconds = max(exchange.ends - time.monotonic(), 0.0)
-            reply = await asyncio.wait_for(self._asked(exchange, message), seconds)
+            return await asyncio.wait_for(self._asked(exchange, message), seconds)
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except httpx.RequestError as error:
+            return exchange.failure(error)
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
-        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
-    async def _asked(self, exchange: Exchange, message: bytes) -> Reply | None:
+    async def _asked(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         """Sends and receives. A connection without an answer is closed, also after a cancellation."""
         from websockets.asyncio.client import connect
 
@@ -191,6 +198,6 @@ class AsyncStreams(Streams):
         try:
             await connection.send(message)
             reply = self._read(exchange, await connection.recv())
+            return reply
         finally:
             self._keep(connection, path, reply)
-        return reply

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import secrets
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import httpx
@@ -61,8 +62,7 @@ class Exchange:
         self.ends = self.began + self.seconds
         self._most = MOST_PREPARED if request.slow else MOST
         self._id = secrets.token_hex(8)
-        self._chunks: list[bytes] = []
-        self._size = 0
+        self.content = bytearray()
 
     def arguments(self, timeout: float) -> dict[str, Any]:
         """The arguments of httpx's `stream`. Connecting may never take longer than `timeout`."""
@@ -87,29 +87,20 @@ class Exchange:
 
     def take(self, chunk: bytes) -> None:
         """Takes a piece of the body. Raises httpx.ReadTimeout if too little time is left to parse it."""
-        self._size += len(chunk)
-        if self._size > self._most:
+        self.content += chunk
+        if len(self.content) > self._most:
             raise httpx.ReadError(f"the answer has more than {self._most} bytes")
-        if time.monotonic() + UNDERSTANDING * self._size > self.ends:
+        if time.monotonic() + UNDERSTANDING * len(self.content) > self.ends:
             raise httpx.ReadTimeout("the time of this try is over")
-        self._chunks.append(chunk)
 
-    def reply(self, response: httpx.Response) -> Reply | None:
-        """The reply; None if it belongs to an earlier request, so that its connection has to be closed."""
-        if response.headers.get(MINE, self._id) != self._id:
-            return None
-        reply = self.told(response, b"".join(self._chunks))
-        return None if stale(self.request, reply) else reply
-
-    def told(self, response: httpx.Response, content: bytes) -> Reply:
-        """The reply with this body."""
-        names = {name.lower(): value for name, value in response.headers.items()}
-        return Reply(response.status_code, names, content, *self._taken())
-
-    def streamed(self, status: int, headers: dict[str, str], document: Any) -> Reply | None:
-        """The reply that came as a message of a stream; None if it is about another step."""
-        reply = Reply(status, headers, b"", *self._taken(), parsed=document)
-        return None if stale(self.request, reply) else reply
+    def reply(self, status: int, headers: Mapping[str, str], document: Any = None) -> Reply | Failure:
+        """The reply with the body taken so far, or with a document from a stream. A Failure if it belongs to
+        another request or is about another step: its connection has to be closed then.
+        """
+        names = {name.lower(): value for name, value in headers.items()}
+        reply = Reply(status, names, bytes(self.content), *self._taken(), parsed=document)
+        another = names.get(MINE.lower(), self._id) != self._id
+        return self.failure(httpx.ReadError(STALE)) if another or stale(self.request, reply) else reply
 
     def _taken(self) -> tuple[float, float, float]:
         now = time.monotonic()

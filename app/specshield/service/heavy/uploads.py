@@ -22,8 +22,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
 
 from specshield import stl
-from specshield.drawing.avoided import avoided
-from specshield.drawing.windows import windows
+from specshield.drawing.rules import avoided, windows
 from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError, PolicyError
 from specshield.policy.methods import METHODS
 from specshield.policy.options import options_to_json, read_options

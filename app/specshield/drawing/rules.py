@@ -1,13 +1,30 @@
-"""The windows of a rule on the time line: the steps at which its temporal operators look."""
+"""What a picture shows of a rule: the regions that it asks to avoid, and its windows on the time line."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from specshield.stl import Always, Eventually, Formula, Until
+from specshield.stl import BODY_WORDS, Always, Eventually, Formula, Implies, Not, Until, body_name
 
 LETTERS: dict[type[Formula], str] = {Always: "G", Eventually: "F", Until: "U"}
+
+
+def is_avoided(formula: Formula, region: str) -> bool:
+    """Whether the formula asks the robot not to be in this region, or not to touch it."""
+    return bool(avoided(formula) & {region, *(body_name(how, region) for how in BODY_WORDS)})
+
+
+def avoided(formula: Formula, negated: bool = False) -> set[str]:
+    """The names that the formula asks not to hold: those below an odd number of negations."""
+    if isinstance(formula, Not):
+        return avoided(formula.child, not negated)
+    if isinstance(formula, Implies):
+        return avoided(formula.left, not negated) | avoided(formula.right, negated)
+    below = [part for part in formula.parts if isinstance(part, Formula)]
+    if not below:
+        return set(formula.names) if negated else set()
+    return set().union(*(avoided(part, negated) for part in below))
 
 
 class Window(NamedTuple):
