@@ -10,6 +10,7 @@ from pathlib import Path
 from evaluation import evaluation, results
 from evaluation.calibration import calibrated
 from evaluation.experiment import Experiment, certifies, split
+from specshield.errors import SpecshieldError
 from specshield.sim.progress import StatusLine, duration
 
 WIDTH = 30  # characters of a progress bar
@@ -31,7 +32,7 @@ def evaluate(
     that was as it had been told. Raises what `split` and `evaluation.check` raise before the first run.
     """
     for name in methods:
-        split(name.replace("@conformal", "@0"))
+        _check(name)
     folders = [None if out is None else out / e.setting.case.name / e.noise for e in experiments]
     for experiment, folder in zip(experiments, folders, strict=True):
         if folder is not None:
@@ -59,6 +60,15 @@ def evaluate(
             not record.satisfied and certifies(record.method) for record in records
         )
     return 1 if broken else 0
+
+
+def _check(method: str) -> None:
+    """Raises what `split` raises. A number stands for the margin of a calibration, which is not known yet."""
+    try:
+        split(method.replace("@conformal", "@0"))
+    except SpecshieldError as error:
+        error.got = method
+        raise
 
 
 class _Progress(StatusLine):

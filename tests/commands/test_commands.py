@@ -143,13 +143,17 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp
     assert refused.stdout == ""
 
 
+POLICY = ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")
+
+
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        (("policy", "--map", "none.yaml", "--rule", "F[0,9] x > 1"), "--map: none.yaml cannot be read"),
+        ((*POLICY, "--map", "none.yaml"), "--map: none.yaml cannot be read"),
         (("run", "case1", "--target", "2.5"), "--target: not a place"),
         (("train", "--case", "1", "--updates", 9), "--updates: unknown option"),
         (("train", "--case", "1", "--option", "beam=x"), "--option beam: the value is not valid"),
+        ((*POLICY, "--url", "nope"), "--url: this is not the address of a server"),
         (("run", "case1", "--shaping", "nope"), "unknown shaping; got 'nope'; expected one of projection"),
     ],
 )

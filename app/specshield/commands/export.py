@@ -37,7 +37,7 @@ def export(
     ] = 1.0,
 ) -> None:
     """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun. Needs the extra `recordings`."""
-    from specshield.client import ShieldClient
+    from specshield.commands.serving import client_at
     from specshield.recordings.recording import map_of_service, of_record
     from specshield.service.library.maps import Maps
     from specshield.service.sessions import chain
@@ -51,7 +51,7 @@ def export(
             known = Maps(read_settings().or_empty(folder)).get(found.configs[0].map_id)
             grid, rooms = known.grid, known.rooms
     else:
-        with ShieldClient(url, api_key, timeout=30.0) as client, tempfile.TemporaryDirectory() as folder:
+        with client_at(url, api_key) as client, tempfile.TemporaryDirectory() as folder:
             client.sessions.get(session).save_record(Path(folder) / "record")
             found = chain.read((Path(folder) / "record").read_bytes())
             with suppress(NotFound):  # a map may be deleted once its sessions are closed

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from specshield.errors import InputError, PolicyError
+from specshield.errors import InputError, MapError, PolicyError
 
 if TYPE_CHECKING:  # every command imports this module
     from specshield.client import Map, Policy, ShieldClient
@@ -97,7 +97,7 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
         return lambda client: client.maps.upload(path, image)
     if isinstance(content.get("rooms"), list):
         sizes = {} if assets is None else _read(assets, "--assets")
-        return lambda client: client.maps.procthor(content, sizes)
+        return lambda client: _sent_house(client, content, sizes)
     if "info" in content:
         return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
     raise InputError(
@@ -107,6 +107,15 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
         expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid, or an "
         "object with its `format`",
     )
+
+
+def _sent_house(client: ShieldClient, house: Any, sizes: dict[str, Any]) -> Map:
+    try:
+        return client.maps.procthor(house, sizes)
+    except MapError as error:
+        if "asset_sizes" in (error.expected or ""):
+            error.expected = "the sizes of all furniture, in the file of --assets"
+        raise
 
 
 def _read(path: Path, option: str) -> dict[str, Any]:

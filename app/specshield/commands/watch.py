@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -20,9 +19,9 @@ def watch(
     limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
 ) -> None:
     """Show the decisions of a session as they are made, one in each line."""
-    from specshield.client import ShieldClient
+    from specshield.commands.serving import client_at
 
-    with ShieldClient(url, api_key=os.environ.get("SPECSHIELD_API_KEY")) as client:
+    with client_at(url) as client:
         found = client.sessions.get(session)
         rule = found.rule_at(after + 1)
         print(f"session {found.id}: {rule}")
