@@ -9,12 +9,12 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, leaf
-from specshield.policy.lattice import SHORTEST_MOVE
+from specshield.policy.lattice import SHORTEST_MOVE, leads_back
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
 from specshield.policy.planner.way import Way, World, holds, keeps, lead, move, note_at, read_at, stay
-from specshield.robot.dynamics import displacement, motion_count
+from specshield.robot.dynamics import motion_count
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
@@ -117,15 +117,10 @@ def descend_by_beam(
         kept = 0
         way.spent[0] += 3.0 * count
         for w in range(count):
-            last = trail[i - 1, w, 1]
-            moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
-            if shortest > 0:
-                moved = turned = 0.0  # there is time, so it may go to and fro
+            last = trail[i - 1, w, 1] if shortest == 0 else -1  # if there is time, it may go to and fro
             before = places[i - 1, w]
             for m in range(motion_count(body)):
-                d, angle = displacement(body, m)
-                back = d * moved < 0.0 or angle * turned < 0.0
-                if back or (m == world.pad and world.stands):
+                if leads_back(body, last, m) or (m == world.pad and world.stands):
                     continue
                 x, y, theta = lead(world, before[0], before[1], before[2], m)
                 led = abs(x - before[0]) + abs(y - before[1]) > SHORTEST_MOVE or theta != before[2]
