@@ -160,23 +160,26 @@ def slack_at(
     return max(at_once, _after_dwells(guide, mask, t, corners, count, h, scratch))
 
 
+@inlined
+def number_of(stride: Ints, dwell: Ints, status: Int8s, run: Ints) -> int:
+    """The progress as one number (stepwise.py), without the `always`. stride, dwell, status, run (K,)."""
+    number = 0
+    for k in range(status.shape[0]):
+        number += stride[k] * (min(run[k], dwell[k]) if status[k] == PENDING else dwell[k] + 1)
+    return number
+
+
 @leaf
 def _steps_ahead(guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch) -> float:
     """How feasible a pose is by step tables: 0 to 1 at step t, and 0 to 1 more for each of DELAYS after which
     it would still be so. SAFE once nothing is pending, HOPELESS if it is not feasible at all.
     """
-    rules, tables, status = guide.rules, guide.tables, scratch.status
-    progress, pending = 0, False
-    for k in range(status.shape[0]):
-        if status[k] == BROKEN:
-            return HOPELESS
-        pending = pending or status[k] == PENDING
-        if rules.kind[k] != ALWAYS:
-            settled = tables.dwell[k] + 1
-            digit = min(scratch.run[k], tables.dwell[k]) if status[k] == PENDING else settled
-            progress += tables.stride[k] * digit
-    if not pending:
+    tables = guide.tables
+    if is_broken(scratch.status):
+        return HOPELESS
+    if PENDING not in scratch.status:
         return SAFE
+    progress = number_of(tables.stride, tables.dwell, scratch.status, scratch.run)
     v, u, h = coordinates(guide.body, tables.pitch, tables.code.shape[2], x, y, theta)
     count, ahead = find_corners(tables.cell, v, u, scratch.corners), 0.0
     for delay in DELAYS:
