@@ -12,7 +12,7 @@ from specshield.compiled import box
 from specshield.policy.lattice import STEP_CODES
 from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.policy.progress.recall import Past
-from specshield.policy.reachability.beam import beam_search
+from specshield.policy.reachability.beam import Terms, beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
@@ -147,13 +147,16 @@ def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
     np.testing.assert_allclose(poses[3], pose(5))
 
 
+def beam_from(guide, t, roots, steps, terms):
+    """The ways of a beam from poses at step t, with nothing settled."""
+    status, run = np.full((len(roots), 1), PENDING, np.int8), np.zeros((len(roots), 1), np.int64)
+    return beam_search(guide, t, roots, status, run, steps, terms, make_scratch(guide.rules, 4))
+
+
 def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
     """One root is a cell before A and faces it, the other faces north; a beam from step 6 has four steps."""
     roots = np.array([pose(4), pose(4, 1)])
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((2, 4), -1), np.zeros(2, np.int64)
-    status, run = np.full((2, 1), PENDING, np.int8), np.zeros((2, 1), np.int64)
-    beam_search(visit, 6, roots, status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
+    motions, taken = beam_from(visit, 6, roots, 4, Terms(4, 0.0, np.inf, 1))
     assert taken.tolist() == [1, 2]
     assert motions[0, 0] == FORWARD
     assert motions[1, :2].tolist() == [RIGHT, FORWARD]
@@ -161,18 +164,12 @@ def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
 
 def test_a_beam_that_looks_at_one_motion_in_two_looks_at_the_others_a_step_later(visit):
     """Two cells before A: it goes on, waits where it does not look at going on, and goes on then."""
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((1, 5), -1), np.zeros(1, np.int64)
-    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
-    beam_search(visit, 5, pose(3)[None], status, run, 2, 0.0, np.inf, 2, scratch, motions, taken)
+    motions, taken = beam_from(visit, 5, pose(3)[None], 5, Terms(2, 0.0, np.inf, 2))
     assert motions[0, : taken[0]].tolist() == [FORWARD, WAIT, FORWARD]
 
 
 def test_a_beam_gives_up_what_comes_too_late(visit):
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((1, 1), -1), np.zeros(1, np.int64)
-    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
-    beam_search(visit, 9, pose(3)[None], status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
+    _, taken = beam_from(visit, 9, pose(3)[None], 1, Terms(4, 0.0, np.inf, 1))
     assert taken.tolist() == [0]
 
 

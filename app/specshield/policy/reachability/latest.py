@@ -27,7 +27,7 @@ from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints, Singles
 from specshield.compiled import Boxed, box, kernel
 from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, goals_of
-from specshield.policy.reachability.beam import MAX_SCORED, beam_search
+from specshield.policy.reachability.beam import MAX_SCORED, Terms, beam_search
 from specshield.policy.reachability.guide import copy_progress, make_scratch
 from specshield.policy.reachability.tables import LATE, Guide, Tables, guided, slack
 from specshield.robot.dynamics import motion_count
@@ -282,7 +282,8 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
     tables, horizon, motions = guide.tables, guide.tables.end[-1], motion_count(guide.body)
     scratch, every = make_scratch(guide.rules, motions), 1 + (motions - 1) // MAX_SCORED
     tried, found = 0, 0
-    here, run, taken = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64), np.empty(1, np.int64)
+    here, run = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64)
+    terms = Terms(width, late - 1.0, np.inf, every)
     for n in range(poses.shape[0]):
         here[0] = poses[n]
         copy_progress(status[n], run[0], scratch.status, scratch.run)
@@ -291,9 +292,8 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
             ahead = slack(guide, here[0, 0], here[0, 1], here[0, 2], start, scratch)
             t = start + int(np.floor(ahead - late)) + 1
             if start <= t <= end and t < horizon:
-                way = np.empty((1, horizon - t), np.int64)
                 own = status[n : n + 1]
-                beam_search(guide, t, here, own, run, width, late - 1.0, np.inf, every, scratch, way, taken)
+                _, taken = beam_search(guide, t, here, own, run, horizon - t, terms, scratch)
                 tried, found = tried + 1, found + (taken[0] > 0)
                 break
             start = end + 1

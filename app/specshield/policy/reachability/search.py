@@ -18,7 +18,7 @@ from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
 from specshield.policy.progress.recall import Past, Present, resume
-from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, beam_search
+from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, Terms, beam_search
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
 from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, guided, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
@@ -203,29 +203,17 @@ def _follow(
     for _ in range(MAX_ESCAPES if escapes else 0):
         if outcome != STUCK:
             break
-        status, run = scratch.high_status.copy(), scratch.high_run.copy()
+        status, run = scratch.high_status.copy().reshape(1, -1), scratch.high_run.copy().reshape(1, -1)
         x, y, theta = poses[n - 1]
-        copy_progress(status, run, scratch.status, scratch.run)
+        copy_progress(status[0], run[0], scratch.status, scratch.run)
         high = t + n + slack(guide, x, y, theta, t + n, scratch)
-        way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
-        taken = np.empty(1, np.int64)
-        beam_search(
-            guide,
-            t + n,
-            poses[n - 1 : n],
-            status.reshape(1, -1),
-            run.reshape(1, -1),
-            width,
-            high - (t + n) - ESCAPE_LOSS,
-            high + ESCAPE_GAIN,
-            1 + (motion_count(guide.body) - 1) // MAX_SCORED,
-            scratch,
-            way,
-            taken,
-        )
+        every = 1 + (motion_count(guide.body) - 1) // MAX_SCORED
+        terms = Terms(width, high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, every)
+        steps = min(motions.shape[0] - n, ESCAPE_LENGTH)
+        way, taken = beam_search(guide, t + n, poses[n - 1 : n], status, run, steps, terms, scratch)
         if taken[0] == 0:
             break
-        copy_progress(status, run, scratch.status, scratch.run)
+        copy_progress(status[0], run[0], scratch.status, scratch.run)
         n = take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
         outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     if outcome == STUCK:
@@ -251,7 +239,7 @@ def _beam_out(
     guide: Guide, t: int, share: int, width: int, band: float, every: int, starts: Starts, scratch: Scratch
 ) -> None:
     """Looks for a way after every first motion that is wanted, has no way yet, and has a slack of at least
-    `band` [steps]. share, every: see `beam_search`; width: see `continue_all`.
+    `band` [steps]. share, every: see `Terms`; width: see `continue_all`.
     """
     motions, poses = starts.motions, starts.poses
     steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
@@ -261,9 +249,9 @@ def _beam_out(
     most = ROOTS if guide.wait >= 0 else MAX_ROOTS
     while roots.shape[0] > 0:
         some, rest = roots[:most], roots[most:]
-        way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         here, status, run = poses[some, 0], starts.status[some], starts.run[some]
-        beam_search(guide, t + 1, here, status, run, share, band, np.inf, every, scratch, way, taken)
+        terms = Terms(share, band, np.inf, every)
+        way, taken = beam_search(guide, t + 1, here, status, run, steps, terms, scratch)
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:
