@@ -17,7 +17,7 @@ from specshield.compiled import inlined, kernel
 from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Rules
 from specshield.policy.reachability.guide import copy_progress, due, predicate_at, update_progress
 from specshield.policy.reachability.tables import UNKNOWN, Guide, Scratch, is_broken, slack_at
-from specshield.policy.tree import is_new, make_tree, pop, push, put, trace
+from specshield.policy.tree import DEGREE, Grain, enter, make_tree, pop, push, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.narrow measures what they find.
@@ -83,7 +83,7 @@ def finish(
             put(tree, count, x, y, theta, made + 1, here, m)
             copy_progress(scratch.status, scratch.run, tree.status[count], tree.run[count])
             grain = search.grain if left + now > search.top - NEAR else FAR_GRAIN
-            if not is_new(tree, count, grain, False):
+            if enter(tree, count, Grain(1.0, grain, DEGREE), False) < 0:
                 continue
             if _serves(rules, goal, now, x, y, theta, tree.status[0], scratch):
                 trace(tree, count, way)

@@ -43,7 +43,7 @@ from specshield.policy.reachability.tables import (
     slack_at,
 )
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
-from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
+from specshield.policy.tree import Grain, Tree, enter, make_tree, pop, push, put, trace
 from specshield.policy.undo import IMPOSSIBLE, turning_motion
 from specshield.robot.barred import is_barred
 from specshield.robot.contact import overlap
@@ -54,8 +54,7 @@ POSES = 16_384  # that one search may make, in some 10 ms
 FEWER = 2_048  # the same, if one decision tries several maps
 INSIDE = 128  # the same, from inside an obstacle or off the map, where each pose costs up to 190 us
 ONWARD = 0.3  # [steps] of slack that a step farther on its way is worth
-PLACE_GRAIN = 20.0  # [1/m] places that are equal after multiplying by this and rounding down count once
-HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
+GRAIN = Grain(20.0, 1.0, 60.0 / (2.0 * math.pi))  # poses count once within 5 cm and 6 degrees
 BAND = -3.0  # [steps] of slack: how far the tables may err
 NO_WAY, GAVE_UP = -1, -2  # in place of a way: all poses were searched; there were too many of them
 LEGS = 8  # searches for one way, each to the next goal
@@ -200,7 +199,7 @@ def _reach(
                 continue
             put(tree, count, x, y, theta, s + 1, here, m)
             copy_progress(scratch.status, scratch.run, tree.status[count], tree.run[count])
-            slot = _slot_of(tree, count)
+            slot = enter(tree, count, GRAIN, True)
             if slot < 0:
                 continue
             if stays and corners == UNKNOWN:
@@ -210,7 +209,7 @@ def _reach(
             ahead = slack_at(guide, x, y, theta, t + s + 1, scratch, about, known)
             spare, most = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             if (ahead < BAND and bounded) or (most < 0.0 and timed):
-                tree.table[slot] = -1  # it is the last of its chain, so it can go; its row is used again
+                tree.table[slot] = -1  # its row is used again
                 continue
             ahead = max(ahead, BAND) if guide.wait >= 0 or ahead >= SAFE or spare == math.inf else spare
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
@@ -248,28 +247,3 @@ def _has_time(rules: Rules, t: int, status: Int8s, run: Ints, goal: int) -> bool
         if k != goal and rules.kind[k] != ALWAYS and status[k] == PENDING and due(rules, k) <= until:
             return False
     return True
-
-
-@leaf
-def _slot_of(tree: Tree, i: int) -> int:
-    """Puts row `i` into the tree's table and returns its slot; -1 if an earlier row has the same place,
-    heading and progress in as few motions.
-    """
-    x, y, h = _rounded(tree.pose, i)
-    slot: int = first_slot(tree, x * 73856093 ^ y * 19349663 ^ h * 83492791)
-    while tree.table[slot] >= 0:
-        other = tree.table[slot]
-        same = _rounded(tree.pose, other) == (x, y, h)
-        for k in range(tree.status.shape[1]):
-            same = same and tree.status[i, k] == tree.status[other, k]
-        if same and tree.made[other] <= tree.made[i]:
-            return -1
-        slot = (slot + 1) & (tree.table.shape[0] - 1)
-    tree.table[slot] = i
-    return slot
-
-
-@leaf
-def _rounded(pose: Floats, i: int) -> tuple[int, int, int]:
-    x, y, h = PLACE_GRAIN * pose[i, 0], PLACE_GRAIN * pose[i, 1], HEADING_GRAIN * pose[i, 2]
-    return math.floor(x), math.floor(y), math.floor(h + 0.5)
