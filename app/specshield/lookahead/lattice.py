@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import coordinates, find_corners, pose_of
+from specshield.policy.lattice import coordinates, find_corners, heading_count, pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -23,7 +23,6 @@ from specshield.policy.progress import (
 )
 from specshield.policy.reachability.guide import make_scratch
 from specshield.policy.reachability.tables import Guide, Tables, slack_at
-from specshield.policy.shape import heading_count
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 from specshield.stl.program import STACK_SIZE

@@ -12,7 +12,7 @@ from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, r
 from specshield.policy.planner.exact import search_exactly
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
-from specshield.policy.progress.values import fill_signals
+from specshield.policy.progress import fill_signals
 from specshield.policy.undo import IMPOSSIBLE, undo_motion
 from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS

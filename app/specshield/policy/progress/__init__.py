@@ -14,8 +14,7 @@ from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import FragmentError
 from specshield.policy.progress.obligations import obligations
-from specshield.policy.progress.values import fill_place, fill_signals, initial_signals
-from specshield.rule.values import REGIONS, places, regions_of
+from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl.program import STACK_SIZE, Programs, compile_predicates, evaluate_packed
 from specshield.task import Task
 from specshield.world.regions import PackedRegions
@@ -56,6 +55,25 @@ def make_rules(task: Task) -> Rules:
 def goals_of(rules: Rules) -> Ints:
     """The obligations that are not an `always`, in their order."""
     return np.flatnonzero(rules.kind != ALWAYS)
+
+
+def initial_signals(task: Task) -> Floats:
+    """The values that the signals hold before their first samples, shape (S,)."""
+    return np.array(list(task.signals.values()), np.float64)
+
+
+@inlined
+def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values: Floats) -> None:
+    """Fills the pose and every region into `values` (rule/values.py); the signals are left as they are."""
+    fill_pose(x, y, theta, values)
+    for r in range(regions.plain.shape[0]):
+        fill_region(regions, r, values)
+
+
+@inlined
+def fill_signals(regions: PackedRegions, signals: Floats, values: Floats) -> None:
+    """Fills signals (S,) into `values`."""
+    copy_row(signals, values[REGIONS + regions.plain.shape[0] :])
 
 
 @leaf

@@ -4,7 +4,7 @@ its headings.
 Tables are made on crossings. A dock smaller than a cell, or a heading that no crossing has, holds at none of
 them, and the tables would say that nothing leads there. So such a predicate counts as kept wherever it holds
 within about half a cell and half a heading: the tables lead near, and the rest of the way is searched for in
-exact poses (finish.py).
+exact poses (narrow.py).
 """
 
 from __future__ import annotations
