@@ -24,8 +24,7 @@ from numba.core.lowering import BaseLower
 from specshield.arrays import Floats
 from specshield.compiled import box
 from specshield.policy.lattice import Lattice
-from specshield.policy.progress import make_rules
-from specshield.policy.progress.recall import Past
+from specshield.policy.progress import Past, make_rules
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import go_around
 from specshield.policy.reachability.latest import sweep

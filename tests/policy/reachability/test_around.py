@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from specshield.compiled import box
-from specshield.policy.progress import PENDING, SETTLED, make_rules
-from specshield.policy.progress.recall import pasts
+from specshield.policy.progress import PENDING, SETTLED, make_rules, pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells, spare_on
 from specshield.policy.reachability.around.search import GAVE_UP, GRAIN, NO_WAY, POSES, go_around
 from specshield.policy.reachability.policy import synthesise

@@ -10,8 +10,7 @@ import pytest
 
 from specshield.compiled import box
 from specshield.policy.lattice import STEP_CODES
-from specshield.policy.progress import BROKEN, PENDING, SETTLED
-from specshield.policy.progress.recall import Past
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past
 from specshield.policy.reachability.beam import Terms, beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise

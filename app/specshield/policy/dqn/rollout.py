@@ -10,8 +10,7 @@ from specshield.policy.detour import copy_ways, find_sibling, find_twins, is_sam
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
 from specshield.policy.dqn.observation import State, arrive, make_state, observe, outcome, place
 from specshield.policy.dqn.scene import Scene
-from specshield.policy.progress import BROKEN, PENDING, SETTLED, Rules, advance
-from specshield.policy.progress.recall import Past, Present, recall
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past, Present, Rules, advance, recall
 from specshield.robot.dynamics import motion_count, step, successors
 
 

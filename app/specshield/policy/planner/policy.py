@@ -35,7 +35,7 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
-from specshield.policy.progress.recall import residuals
+from specshield.policy.progress import residuals
 from specshield.policy.reachability.stored import check_fit
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.policy.undo import turning_motion

@@ -18,8 +18,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import Boxed, inlined, kernel, leaf
 from specshield.policy.detour import copy_ways
-from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Rules
-from specshield.policy.progress.recall import Past
+from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Past, Rules
 from specshield.policy.reachability.guide import copy_progress, due, fill, predicate_at, update_progress
 from specshield.policy.reachability.search import begin, go_back, join_sibling, take
 from specshield.policy.reachability.tables import (

@@ -22,9 +22,8 @@ from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.progress import Rules, make_rules
+from specshield.policy.progress import Rules, make_rules, pasts
 from specshield.policy.progress.obligations import obligations
-from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack

@@ -17,7 +17,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
-from specshield.policy.progress.recall import Past, Present, resume
+from specshield.policy.progress import Past, Present, resume
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, Terms, beam_search
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
 from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, guided, slack

@@ -20,8 +20,7 @@ from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
-from specshield.policy.progress.recall import Past, resume
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Past, Rules, advance, resume
 from specshield.policy.reachability.around.field import spare_on
 from specshield.policy.reachability.guide import (
     copy_progress,
