@@ -66,9 +66,8 @@ def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bo
         _, heading, _ = reads(rules, int(k))
         if heading:
             continue
-        outer, inner = np.zeros((ny, nx, 1), np.bool_), np.zeros((ny, nx, 1), np.bool_)
         near = pitch + 2.0 * swing_radius(body)
-        look(body, rules, int(k), pitch, 4, np.full((ny, nx), True), np.zeros(1), near, outer, inner)
+        outer, _ = look(body, rules, int(k), pitch, 1, np.full((ny, nx), True), np.zeros(1), near)
         there = outer[..., 0]
         if there.any():
             first = rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)

@@ -73,10 +73,10 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
     """
     states, digits = state_count(rules), digits_of(rules)
     used = row >= 0
-    pattern = np.zeros(lattice.valid.shape, np.int64)
+    held = np.zeros(lattice.valid.shape, np.int64)
     for k in range(len(rules.kind)):
-        pattern |= holds[k].astype(np.int64) << k
-    patterns, of = np.unique(pattern[used], return_inverse=True)
+        held |= holds[k].astype(np.int64) << k
+    patterns, of = np.unique(held[used], return_inverse=True)
     of = of.reshape(-1, lattice.headings)
     bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
     valid: Bytes = lattice.valid[used]
@@ -86,7 +86,9 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
         asked = sum(
             1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
         )
-        after = np.array([transitions(rules, *digits, states, t, p) for p in patterns]).reshape(-1, states)
+        after = np.empty((len(patterns), states), np.int64)
+        for n, pattern in enumerate(patterns):
+            after[n] = transitions(rules, *digits, states, t, pattern)
         after[(patterns & asked) != asked] = BROKEN_STATE
         before = np.zeros_like(bits[t])
         _before(bits[t], valid, of, after, before)
