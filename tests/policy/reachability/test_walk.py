@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +13,9 @@ from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past
 from specshield.policy.reachability.beam import Terms, beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
-from specshield.policy.reachability.search import continue_all
+from specshield.policy.reachability.search import begin, continue_all, go_back
 from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
-from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
+from specshield.policy.reachability.walk import SETTLED_ALL, climb
 from specshield.robot.dynamics import motion_count, step, successors
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
@@ -78,8 +77,7 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
 
 
 def scored(guide, where, t, scratch, last=-1, some=(0, 1)):
-    x, y, theta = where
-    score(guide, x, y, theta, math.cos(theta), math.sin(theta), t, last, some, scratch)
+    score(guide, *where, t, last, some, scratch)
     return scratch.scores.tolist()
 
 
@@ -140,10 +138,11 @@ def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
     base, led, scratch = begun(visit, pose(4), FORWARD)
     climb(visit, 0, 1, base, led, scratch, True)
     assert base.tolist() == [FORWARD, FORWARD] + [WAIT] * 8
-    motions, poses, scratch = begun(visit, pose(3, 1), LEFT)
-    assert rejoin(visit, 0, RIGHT, -1, base, led, 0, motions, poses, scratch)
-    assert motions.tolist() == [LEFT, RIGHT, FORWARD, FORWARD] + [WAIT] * 6
-    np.testing.assert_allclose(poses[3], pose(5))
+    motions, poses = np.empty((4, 10), np.int64), np.empty((4, 10, 3))
+    starts = begin(visit, past_at(3), every(4)[0], motions, poses)
+    assert go_back(visit, LEFT, base, led, starts)
+    assert motions[LEFT].tolist() == [LEFT, RIGHT, FORWARD, FORWARD] + [WAIT] * 6
+    np.testing.assert_allclose(poses[LEFT, 3], pose(5))
 
 
 def beam_from(guide, t, roots, steps, terms):

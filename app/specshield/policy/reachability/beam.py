@@ -164,7 +164,7 @@ def _expand(guide: Guide, t: int, n: int, count: int, open_roots: int, beam: Bea
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
         some = ((31 * w + n) * 2654435761 >> 16) % every, every  # scattered by Knuth's hash
         cos, sin, room = around(body, before_x, before_y, before)
-        corners = score(guide, before_x, before_y, before, cos, sin, t + n, -1, some, scratch)
+        corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(some[0], motion_count(body), some[1]):

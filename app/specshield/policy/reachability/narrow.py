@@ -87,8 +87,8 @@ def continue_narrow(
     are those of `continue_all`. The robot has to be one that can wait.
     """
     guide = guided(boxed, margin)
-    starts, scratch = begin(guide, past, wanted, motions, poses)
-    now, order, twin, settled = starts.now, starts.order, starts.twin, starts.settled
+    starts = begin(guide, past, wanted, motions, poses)
+    now, scratch, order, twin, settled = starts.now, starts.scratch, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):
         return -1
     known = np.empty(order.shape[0], np.int64)
@@ -108,9 +108,9 @@ def continue_narrow(
         if base < 0:  # no first motion leads on, as far as the search from x_t can tell
             fill(1, guide.wait, motions[m], poses[m])
             continue
-        settled[m] = join_sibling(guide, now.t, known[:ways], int(m), starts, scratch)
+        settled[m] = join_sibling(guide, known[:ways], int(m), starts)
         if not settled[m]:
-            settled[m] = go_back(guide, now.t, int(m), way[1:], led[1:], starts, scratch)
+            settled[m] = go_back(guide, int(m), way[1:], led[1:], starts)
         if not settled[m]:
             copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
             settled[m] = _go(guide, narrow, AFTER, now.t, motions[m], poses[m], scratch)

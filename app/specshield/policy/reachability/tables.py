@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -241,27 +242,19 @@ def is_broken(status: Int8s) -> bool:
 
 @inlined
 def score(
-    guide: Guide,
-    x: float,
-    y: float,
-    theta: float,
-    cos: float,
-    sin: float,
-    t: int,
-    last: int,
-    some: tuple[int, int],
-    scratch: Scratch,
+    guide: Guide, x: float, y: float, theta: float, t: int, last: int, some: tuple[int, int], scratch: Scratch
 ) -> int:
     """Writes L where each motion from x_t ends if it meets nothing into scratch.scores, without the progress
     of that step: a cheap order in which to try motions. To the last bit, `slack_at` then has the same of
     motions that change no progress.
 
-    cos, sin: of theta. last: the motion before, -1 for none; motions that lead straight back are HOPELESS,
-    since the tables err by a little. some: the first motion that is scored, and the stride to the next;
-    others are HOPELESS. Writes the corners about (x, y) into scratch.corners and returns how many there are,
-    UNKNOWN if they were not needed.
+    last: the motion before, -1 for none; motions that lead straight back are HOPELESS, since the tables err
+    by a little. some: the first motion that is scored, and the stride to the next; others are HOPELESS.
+    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if they were
+    not needed.
     """
     body, _, tables, wait, _ = guide
+    cos, sin = math.cos(theta), math.sin(theta)
     scores, mask = scratch.scores, settled_goals(tables, scratch.status)
     if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
         scores[:] = SAFE

@@ -86,8 +86,8 @@ def go_around(
     can do without. poses (M, T - t, 3): overwritten.
     """
     guide, (count, steps) = guided(boxed, margin), motions.shape
-    starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
-    now, t = starts.now, starts.now.t
+    starts = begin(guide, past, np.ones(count, np.bool_), motions, poses)
+    now, t, scratch = starts.now, starts.now.t, starts.scratch
     inside = overlap(guide.body, now.pose[0], now.pose[1], now.pose[2]) >= guide.body.radius
     most = min(most, INSIDE) if inside else most
     tree = make_tree(most, guide.rules.kind.shape[0])
@@ -120,7 +120,7 @@ def go_around(
         if m == way[0]:
             copy_row(way, motions[m])
         elif guide.wait >= 0:
-            go_back(guide, t, m, way, led, starts, scratch)
+            go_back(guide, m, way, led, starts)
         elif starts.turn[m] != IMPOSSIBLE:
             join(starts.turn[m], starts.move[m], way, 0, guide.wait, motions[m])
     return int(way[0])
