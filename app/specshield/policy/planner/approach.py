@@ -59,11 +59,8 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
         to_go_after(body, world.fields, f, x, y, theta, last, scores)
         barred = False  # whether a motion that leads down would break what has to hold
         while True:
-            m = world.pad if barred and waits else 0
-            for i in range(scores.shape[0]):
-                if scores[i] < scores[m] and not (barred and waits):
-                    m = i
-            padding = not scores[m] < OUT_OF_REACH
+            m = int(np.argmin(scores))
+            padding = (barred and waits) or not scores[m] < OUT_OF_REACH
             m = world.pad if padding else m
             if padding and not barred:
                 break
