@@ -77,8 +77,8 @@ def _tell(experiment: Experiment, from_start: bool) -> None:
     """In this process, which is of one pool: what is believed is replaced by what is so."""
     setting = experiment.setting
     ahead = prepare(setting.case.task, setting.ours.proposers)
-    goals = ahead.goals
-    row, column = cell_of(ahead.body, goals, *setting.case.target)
+    goals = ahead.bank.goals
+    row, column = cell_of(goals, *setting.case.target)
     around = goals.distance[
         :, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4
     ]  # it is on furniture

@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.policy.progress import residuals
 from specshield.policy.progress.obligations import Obligation, obligations
-from specshield.policy.progress.recall import residuals
 from specshield.robot.dynamics import make_body, motion_count, successors
 from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness, robustness_bounds
 from specshield.task import Task

@@ -39,7 +39,7 @@ def place(planes, column):
     return planes.pad * planes.width + planes.pad + column
 
 
-def goals_of(*ways, distance=300):
+def goals_of(body, *ways, distance=300):
     """A goal for each direction (u, v) to go, all [cm] away, on a grid of one cell."""
     way = np.array(ways, np.int8).reshape(-1, 1, 1, 2)
-    return Goals(1.0, np.full((len(ways), 1, 1), distance, np.uint16), way)
+    return Goals(body, 1.0, np.full((len(ways), 1, 1), distance, np.uint16), way)

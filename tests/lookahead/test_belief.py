@@ -32,10 +32,10 @@ def charge(stand_in, chance, end):
 def observed():
     """After SAID at a pose that faces the first of two goals and has the other behind it."""
     body = make_body(ROBOT, OccupancyGrid(np.zeros((5, 5), bool), 0.2))
-    goals = goals_of((UNIT, 0), (-UNIT, 0))
+    goals = goals_of(body, (UNIT, 0), (-UNIT, 0))
     begun = beliefs.begin(2, MOTIONS)
     pose = np.array([0.5, 0.5, 0.0])
-    return begun, beliefs.update(begun, body, goals, pose, SAID, 0.1, 0.25)
+    return begun, beliefs.update(begun, goals, pose, SAID, 0.1, 0.25)
 
 
 def test_before_anything_is_seen(observed):

@@ -13,13 +13,13 @@ CLOSE = {"rel": 0.02, "abs": 0.02}  # the codes of a table are 1/32 nat, its exp
 
 def solved(formula, ends=0.0, price=0.0, left=0.0):
     """D(t, pose, settled) of a stand-in that says R everywhere."""
-    body, _, planes = make_world(formula)
+    _, _, planes = make_world(formula)
     motions = np.empty((3, *planes.valid.shape), np.float32)
     motions[:] = np.log(R)[:, None, None]
     everywhere = np.full(planes.valid.shape, ends, np.float32)
     stand_in = StandIn(motions, everywhere, price, np.full(planes.valid.shape[1], left, np.float32))
-    table = solve(body, planes, stand_in)
-    return lambda t, pose, settled: desirability(body, planes, table, t, settled, *pose)
+    table = solve(planes, stand_in)
+    return lambda t, pose, settled: desirability(planes, table, t, settled, *pose)
 
 
 def test_one_step_before_the_end_only_one_motion_will_do():

@@ -5,7 +5,7 @@ import pytest
 
 from specshield.lookahead.belief import STYLE
 from specshield.lookahead.desirability import UNKEEPABLE, solve
-from specshield.lookahead.expansion import expand_all
+from specshield.lookahead.expansion import Bank, expand_all
 from specshield.lookahead.goals import UNIT
 from specshield.lookahead.surrogate import AHEAD, OTHER, SEARCH_PRICE, WANDER, WANDER_END, stand_in_for
 from tests.lookahead.by_hand import BACK, EAST, GO, STOP, WEST, goals_of, make_world
@@ -15,13 +15,10 @@ OPEN = np.exp([AHEAD, OTHER, OTHER])  # what it says of going on, back and stopp
 
 def after_each(formula, pose, t=0, settled=0):
     body, rules, planes = make_world(formula)
-    goals = goals_of((UNIT, 0))
-    table = solve(body, planes, stand_in_for(body, goals, planes, WANDER, STYLE))
-    out = np.empty((1, 3))
-    expand_all(
-        body, rules, goals, planes, table[None], np.array([WANDER]), np.array([0]), STYLE, t, settled,
-        np.array(pose), out,
-    )  # fmt: skip
+    goals = goals_of(body, (UNIT, 0))
+    table = solve(planes, stand_in_for(goals, planes, WANDER, STYLE))
+    out, bank = np.empty((1, 3)), Bank(rules, goals, planes, np.array([WANDER]), table[None])
+    expand_all(bank, np.array([0]), STYLE, t, settled, np.array(pose), out)
     return out[0]
 
 

@@ -23,12 +23,12 @@ def room(door):
 
 
 def test_there_is_a_goal_in_each_square_of_half_a_metre():
-    body, goals = room(door=True)
+    _, goals = room(door=True)
     cells = [tuple(np.argwhere(distance == 0)[0].tolist()) for distance in goals.distance]
     assert goals.pitch == 0.1
     assert cells == [(j, i) for j in (2, 7) for i in (2, 7, 12, 17)]
-    assert [cell_of(body, goals, 0.1 * (i + 0.5), 0.1 * (j + 0.5)) for j, i in cells] == cells
-    assert cell_of(body, goals, -3.0, 9.0) == (9, 0)  # the nearest to a point outside
+    assert [cell_of(goals, 0.1 * (i + 0.5), 0.1 * (j + 0.5)) for j, i in cells] == cells
+    assert cell_of(goals, -3.0, 9.0) == (9, 0)  # the nearest to a point outside
 
 
 def test_distances_and_ways_go_through_the_door():

@@ -7,10 +7,10 @@ from tests.lookahead.by_hand import BACK, EAST, GO, STOP, WEST, make_world, plac
 
 
 def test_the_lattice_knows_where_poses_are_free_and_which_motions():
-    body, _, planes = make_world("F[0,1] B and G[0,1] not B")
+    _, _, planes = make_world("F[0,1] B and G[0,1] not B")
     west, east = place(planes, 0), place(planes, 1)
     assert np.flatnonzero(planes.valid[0]).tolist() == [west, east]
-    assert pose_at(body, planes, 0, west) == WEST
+    assert pose_at(planes, 0, west) == WEST
     assert planes.free[:, 0, west].tolist() == [1.0, 0.0, 1.0]  # GO, BACK, STOP
     assert planes.free[:, 0, east].tolist() == [0.0, 1.0, 1.0]
     assert planes.row[[west, east]].tolist() == [0, 1]

@@ -11,7 +11,7 @@ import pytest
 
 from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, desirability, solve
-from specshield.lookahead.expansion import expand_all
+from specshield.lookahead.expansion import Bank, expand_all
 from specshield.lookahead.goals import make_goals
 from specshield.lookahead.lattice import blocked_at, make_planes
 from specshield.lookahead.lookahead import FORCED, prepare
@@ -80,7 +80,7 @@ def solve_cells(r, e, price, left):
     for s, (i, j, h) in enumerate(STATES):
         at = (j + planes.pad) * planes.width + i + planes.pad
         motions[:, h, at], ends[h, at], remaining[at] = np.log(r[s]), e[s], left[s]
-    return planes, solve(WORLD.body, planes, StandIn(motions, ends, price, remaining))
+    return planes, solve(planes, StandIn(motions, ends, price, remaining))
 
 
 @pytest.mark.parametrize(("price", "slope"), [(0.0, 0.0), (0.5, 1.5)])
@@ -94,7 +94,7 @@ def test_desirability_is_exact_where_the_lattice_is(price, slope):
             pose = WORLD.pose(*state)
             if not planes.valid[state[2]][(state[1] + planes.pad) * planes.width + state[0] + planes.pad]:
                 continue
-            found = desirability(WORLD.body, planes, table, t, mask, *pose)
+            found = desirability(planes, table, t, mask, *pose)
             if settled(mask, s, t) != mask or not np.isfinite(wanted[t, mask][s]):
                 continue
             assert found == pytest.approx(wanted[t, mask][s], rel=0.03, abs=0.03)
@@ -112,20 +112,16 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
     free = [s for s, (i, j, _) in enumerate(STATES) if not body.occupied[j, i]]
     for s in free:
         pose = WORLD.pose(*STATES[s])
-        e[s] = follow(body, goals, lead, STYLE, tuple(pose), blocked_at(body, *pose), log_r)
-        r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
+        e[s] = follow(goals, lead, STYLE, tuple(pose), blocked_at(body, *pose), log_r)
+        r[s], left[s] = np.exp(log_r), price_left(goals, lead, *pose[:2])
     assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
     planes, table = solve_cells(r, e, step_price(lead), left)
     wanted, seen = exact(r, e, step_price(lead), left), 0
     for t, mask, s in itertools.product(range(HORIZON), range(4), free):
         if settled(mask, s, t) != mask or planes.slot[t, mask] < 0:
             continue
-        found = np.empty((1, MOTIONS))
-        asked = np.array([0])
-        pose = np.array(WORLD.pose(*STATES[s]))
-        expand_all(
-            body, rules, goals, planes, table[None], np.array([lead]), asked, STYLE, t, mask, pose, found
-        )
+        found, bank = np.empty((1, MOTIONS)), Bank(rules, goals, planes, np.array([lead]), table[None])
+        expand_all(bank, np.array([0]), STYLE, t, mask, np.array(WORLD.pose(*STATES[s])), found)
         for m in range(MOTIONS):
             after = int(WORLD.table[s, m])
             then = settled(mask, after, t + 1)
@@ -155,9 +151,9 @@ def test_the_way_that_is_left_has_a_price_round_walls_and_through_narrow_doors()
             straight = math.hypot(x - at[0], y - at[1])
             assert (through - straight) / 0.2 > 4.0
             least = (through - 1.0) / 0.2  # corners are taken wider
-            assert least - 0.5 <= price_left(body, goals, goal, *at) <= 1.2 * least
-        assert price_left(body, goals, goal, x, y) == 0.0
-        assert price_left(body, goals, WANDER, 0.75, 0.75) == 0.0
+            assert least - 0.5 <= price_left(goals, goal, *at) <= 1.2 * least
+        assert price_left(goals, goal, x, y) == 0.0
+        assert price_left(goals, WANDER, 0.75, 0.75) == 0.0
 
 
 def test_following_it_costs_what_the_best_path_does():
@@ -176,7 +172,7 @@ def test_following_it_costs_what_the_best_path_does():
             then = settled(mask, after, t + 1)
             if then is not None and np.isfinite(wanted[t + 1, then][after]):
                 feasible[m] = True
-                left[m] = desirability(WORLD.body, planes, table, t + 1, then, *WORLD.pose(*STATES[after]))
+                left[m] = desirability(planes, table, t + 1, then, *WORLD.pose(*STATES[after]))
         chosen = restrict(log_softmax(np.log(r[s]) - left), feasible)
         total = 0.0
         for m in np.flatnonzero(chosen > 0.0):
@@ -234,12 +230,12 @@ def drive(speak, steps=25, start=(-0.4, 2.4, 0.2), forced=FORCED):
 
 def seeks(goal):
     """What the surrogate itself would say with this goal, or WANDER, and a sharpness of its own."""
-    ahead = prepare(TASK)
+    goals = prepare(TASK).bank.goals
 
     def speak(t, pose, random):
-        blocked = blocked_at(ahead.body, *pose)
+        blocked = blocked_at(goals.body, *pose)
         log_r, style = np.empty(len(blocked)), np.array(SHARP_STYLE)
-        end = follow(ahead.body, ahead.goals, goal, style, tuple(pose), blocked, log_r)
+        end = follow(goals, goal, style, tuple(pose), blocked, log_r)
         of = TASK.robot.motion_of
         shares = np.bincount(of[~TASK.robot.terminal])
         return np.where(TASK.robot.terminal, np.log(max(end, 1e-4)), log_r[of] - np.log(shares[of]))
@@ -249,11 +245,11 @@ def seeks(goal):
 
 def test_it_learns_where_a_model_goes():
     ahead = prepare(TASK)
-    goal = len(ahead.goals.distance) - 1
+    goal = len(ahead.bank.goals.distance) - 1
     _, _, given = drive(seeks(goal))
     belief = given[-1][0]
-    row, column = np.argwhere(ahead.goals.distance[goal] == 0)[0]
-    off = ahead.goals.distance[:, row, column] / 100.0  # metres from each goal to the true one
+    row, column = np.argwhere(ahead.bank.goals.distance[goal] == 0)[0]
+    off = ahead.bank.goals.distance[:, row, column] / 100.0  # metres from each goal to the true one
     *goals, wander = belief.probabilities()
     assert goals @ off < 0.25 * off.mean()
     assert wander < 0.1

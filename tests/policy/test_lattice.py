@@ -10,20 +10,19 @@ import pytest
 from specshield.policy.lattice import (
     INVALID,
     NO_TIME,
+    STEP_CODES,
     Corners,
     bilinear,
     coordinates,
-    coordinates_ahead,
     corner,
     find_corners,
-    heading_after,
+    heading_count,
     leads_back,
     make_lattice,
     pose_of,
 )
-from specshield.policy.planner.fields import OUT_OF_REACH, UNREACHED, Fields, to_go
+from specshield.policy.planner.fields import OUT_OF_REACH, UNREACHED, Fields, to_go, to_go_after
 from specshield.policy.reachability.tables import HOPELESS, latest_at
-from specshield.policy.shape import heading_count
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
 from specshield.world.occupancy import OccupancyGrid
@@ -31,6 +30,7 @@ from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
 
 CORRIDOR = OccupancyGrid(np.array([[0, 0, 0, 1]], bool), CELL)
 TURNED = OccupancyGrid(np.zeros((10, 20), bool), 0.1, (1.0, -2.0, 0.7))
+MOVES = ((0.2, 0.0), (0.0, math.radians(30)), (0.0, math.radians(-30)))  # of a Stretch: ahead, left, right
 
 
 def test_the_fewest_headings_that_every_turn_fits():
@@ -114,14 +114,22 @@ def test_a_full_table_at_one_heading():
 
 
 def test_a_motion_from_a_place_between_the_crossings():
-    body = make_body(STRETCH, TURNED)
+    """Steps to go that rise by 10 along the rows, by 1 along the columns, or by 1 from heading to heading."""
+    body, out = make_body(STRETCH, TURNED), np.empty(len(STRETCH.motions))
+    cell = np.arange(200, dtype=np.int32).reshape(10, 20)
+    code = np.empty((2, 200, 60), np.uint16)
+    code[0], code[1] = STEP_CODES * (10 * (cell // 20) + cell % 20).reshape(-1, 1), STEP_CODES * np.arange(60)
+    fields, (ahead, left, right) = Fields(cell, code, 0.1), map(STRETCH.motions.index, MOVES)
     x, y, _ = pose_of(body, 0.1, 60, 3, 5, 0)
-    v, u, h, dv, du = coordinates_ahead(body, 0.1, 60, x, y, 0.7 + math.pi / 6)  # 30 degrees from the columns
-    assert (v, u) == pytest.approx((3.0, 5.0))
-    assert h == pytest.approx((0.7 + math.pi / 6) * 60 / (2 * math.pi))
-    assert (dv, du) == pytest.approx((5.0, 10.0 * math.cos(math.pi / 6)))  # cells a metre
-    assert heading_after(60, 2.0, math.radians(12)) == pytest.approx(4.0)
-    assert heading_after(60, 2.0, math.radians(-18)) == pytest.approx(59.0)
+    theta = 0.7 + math.pi / 6  # 30 degrees from the columns: 0.2 m lead on by 1 row and 1.73 columns
+    to_go_after(body, fields, 0, x, y, theta, -1, out)
+    assert out[ahead] == pytest.approx(40.0 + 5.0 + 2.0 * math.cos(math.pi / 6))
+    assert out[left] == pytest.approx(35.0)
+    to_go_after(body, fields, 1, x, y, theta, -1, out)
+    h = theta * 60 / (2 * math.pi)
+    assert out[[ahead, left, right]] == pytest.approx([h, h + 5.0, h - 5.0])
+    to_go_after(body, fields, 1, x, y, math.radians(12), -1, out)
+    assert out[right] == pytest.approx(57.0)  # heading 2, and 5 of 60 back
 
 
 def test_what_leads_straight_back():

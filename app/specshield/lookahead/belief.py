@@ -94,9 +94,7 @@ def begin(goals: int, motions: int) -> Belief:
     return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY, 0.0)
 
 
-def update(
-    belief: Belief, body: Body, goals: Goals, pose: Floats, said: Floats, end: float, forced: float
-) -> Belief:
+def update(belief: Belief, goals: Goals, pose: Floats, said: Floats, end: float, forced: float) -> Belief:
     """The belief after what the model said at x_t (3,).
 
     said [M]: the motions' probabilities, given that the model does not end; end: the probability that it
@@ -105,15 +103,15 @@ def update(
     said = np.maximum(said, LEAST_SAID) / np.maximum(said, LEAST_SAID).sum()
     log_said = log(said)
     x, y, theta = (float(v) for v in pose)
-    blocked = blocked_at(body, x, y, theta)
-    charges = _charge(body, goals, belief.style, (x, y, theta), blocked, said, log_said, end)
+    body, blocked = goals.body, blocked_at(goals.body, x, y, theta)
+    charges = _charge(goals, belief.style, (x, y, theta), blocked, said, log_said, end)
     usual = float(inner(said, log_said - log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
     sided = _sided(body, said)  # a stand-in that wanders does not say to which side the model turns
     excess = TRACK * belief.excess + float(inner(belief.probabilities(), charges)) - usual
     excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
-    row, column = cell_of(body, goals, x, y)
-    bearing = bearing_of(body, goals, int(np.argmin(cost[:-1])), row, column, theta)
+    row, column = cell_of(goals, x, y)
+    bearing = bearing_of(goals, int(np.argmin(cost[:-1])), row, column, theta)
     features = np.array([features_of(body, bearing, m, blocked[m]) for m in range(len(said))])
     weight = 0.5 * said + 0.5 / len(said)
     features -= inner(features.T, weight)
@@ -140,14 +138,7 @@ def _sided(body: Body, said: Floats) -> float:
 
 @kernel
 def _charge(
-    body: Body,
-    goals: Goals,
-    style: Floats,
-    pose: Pose,
-    blocked: Bools,
-    said: Floats,
-    log_said: Floats,
-    end: float,
+    goals: Goals, style: Floats, pose: Pose, blocked: Bools, said: Floats, log_said: Floats, end: float
 ) -> Floats:
     """What each goal and wandering are charged, [G + 1]: the KL of the motions said from the stand-in's, and
     the log loss of the chance to end.
@@ -155,7 +146,7 @@ def _charge(
     motions, wander = said.shape[0], goals.distance.shape[0]
     charges, log_r = np.empty(wander + 1), np.empty(motions)
     for g in range(charges.shape[0]):
-        ends = follow(body, goals, g if g < wander else WANDER, style, pose, blocked, log_r)
+        ends = follow(goals, g if g < wander else WANDER, style, pose, blocked, log_r)
         chance = 0.98 * ends + 0.005
         charges[g] = -(end * math.log(chance) + (1.0 - end) * math.log(1.0 - chance))
         for m in range(motions):

@@ -24,7 +24,7 @@ from specshield.compiled import kernel, leaf
 from specshield.lookahead.lattice import Planes
 from specshield.lookahead.surrogate import StandIn
 from specshield.policy.lattice import coordinates, corner
-from specshield.robot.dynamics import Body, displacement
+from specshield.robot.dynamics import displacement
 
 UNKEEPABLE = np.float32(1e6)  # D where the rule cannot be kept
 # [nats] The price of corners from which the rule cannot be kept, beside others. By hand, nothing measured.
@@ -42,7 +42,7 @@ class Sums(NamedTuple):
 
 
 @kernel
-def solve(body: Body, planes: Planes, stand_in: StandIn) -> Codes:
+def solve(planes: Planes, stand_in: StandIn) -> Codes:
     """D as codes [kept, H, rows]."""
     headings, cells = planes.valid.shape
     horizon, sets = planes.slot.shape[0] - 2, planes.slot.shape[1]
@@ -66,7 +66,7 @@ def solve(body: Body, planes: Planes, stand_in: StandIn) -> Codes:
             else:
                 _gather(planes, t + 1, mask, following, stand_in.left, ahead)
                 for h in range(headings):
-                    _back(body, planes, stand_in, h, ahead, price, sums, here)
+                    _back(planes, stand_in, h, ahead, price, sums, here)
             _rule_out(planes.possible[slot] if planes.possible.shape[0] > 0 else planes.valid, here)
             if planes.kept[t, mask] != planes.kept[t + 1, mask]:
                 _encode(planes.row, here, table[planes.kept[t, mask]])
@@ -100,14 +100,7 @@ def _gather(planes: Planes, t: int, mask: int, following: Singles, left: Singles
 
 @kernel
 def _back(
-    body: Body,
-    planes: Planes,
-    stand_in: StandIn,
-    h: int,
-    ahead: Singles,
-    price: np.float32,
-    sums: Sums,
-    out: Singles,
+    planes: Planes, stand_in: StandIn, h: int, ahead: Singles, price: np.float32, sums: Sums, out: Singles
 ) -> None:
     """One step back for the poses of heading h, in flat passes over a plane, which compile to vectors.
 
@@ -119,7 +112,7 @@ def _back(
     least[:] = UNKEEPABLE
     total[:] = 0.0
     for m in range(cost.shape[0]):
-        move, turn = displacement(body, m)
+        move, turn = displacement(planes.body, m)
         move, turn = move / planes.pitch, turn * headings / (2.0 * math.pi)
         low = int(np.floor(turn + 1e-6))
         part = np.float32(max(turn - low, 0.0)) if turn - low > 1e-6 else np.float32(0.0)
@@ -225,9 +218,7 @@ def _encode(row: Ints, values: Singles, out: Codes) -> None:
 
 
 @leaf
-def desirability(
-    body: Body, planes: Planes, table: Codes, t: int, mask: int, x: float, y: float, theta: float
-) -> float:
+def desirability(planes: Planes, table: Codes, t: int, mask: int, x: float, y: float, theta: float) -> float:
     """D at a pose at step t with the goals of `mask` settled [nats]; UNKEEPABLE where no corner has any."""
     if mask < 0 or planes.kept[t, mask] < 0:
         return float(UNKEEPABLE)
@@ -236,19 +227,19 @@ def desirability(
         after += 1
     while before >= 0 and planes.kept[before, mask] == planes.kept[t, mask]:
         before -= 1
-    later = _at(body, planes, table[planes.kept[t, mask]], x, y, theta)
+    later = _at(planes, table[planes.kept[t, mask]], x, y, theta)
     if t == after or before < 0 or planes.kept[before, mask] < 0:
         return later
-    sooner = _at(body, planes, table[planes.kept[before, mask]], x, y, theta)
+    sooner = _at(planes, table[planes.kept[before, mask]], x, y, theta)
     share = (t - before) / (after - before)
     return later if later >= UNKEEPABLE else share * later + (1.0 - share) * sooner
 
 
 @leaf
-def _at(body: Body, planes: Planes, table: Codes, x: float, y: float, theta: float) -> float:
+def _at(planes: Planes, table: Codes, x: float, y: float, theta: float) -> float:
     """Bilinear in a table [H, rows]."""
     headings = table.shape[0]
-    v, u, h = coordinates(body, planes.pitch, headings, x, y, theta)
+    v, u, h = coordinates(planes.body, planes.pitch, headings, x, y, theta)
     low = int(np.floor(h))
     f, total, weights = h - low, 0.0, 0.0
     for n in range(4):

@@ -25,13 +25,15 @@ NO_PATH = 65535  # [cm] the distance from where no path leads to a goal
 
 
 class Goals(NamedTuple):
-    """G goals and the way to each, on a grid of h x w cells of `pitch` [m] in the grid frame.
+    """G goals of a robot on its map and the way to each, on a grid of h x w cells of `pitch` [m] in the grid
+    frame.
 
     distance [G, h, w] [cm]: along space in which the robot can turn, plus the way from beside an obstacle to
     that space; through doors too narrow to turn in if there is no other way; NO_PATH if there is none at all.
     way [G, h, w, 2]: the direction (u, v) to go, times UNIT; zero at the goal.
     """
 
+    body: Body
     pitch: float
     distance: Codes
     way: Int8s
@@ -61,7 +63,7 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
             to_go = np.where(np.isinf(to_go), geodesic_distance(free, goal, pitch), to_go)
         distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, NO_PATH - 1), NO_PATH)
         _steer(falling(onward, off[rooms[row, column]], pitch), way[g])
-    return Goals(pitch, distance, way)
+    return Goals(body, pitch, distance, way)
 
 
 def _places(roomy: Bools, gap: int) -> list[tuple[int, int]]:
@@ -90,7 +92,7 @@ def _steer(height: Floats, way: Int8s) -> None:
 
 
 @leaf
-def cell_of(body: Body, goals: Goals, x: float, y: float) -> tuple[int, int]:
+def cell_of(goals: Goals, x: float, y: float) -> tuple[int, int]:
     """Row and column of the goals' grid at a point of the map frame; the nearest cell for one outside."""
-    (u, v), (_, height, width) = in_grid(body, x, y), goals.distance.shape
+    (u, v), (_, height, width) = in_grid(goals.body, x, y), goals.distance.shape
     return min(max(int(v / goals.pitch), 0), height - 1), min(max(int(u / goals.pitch), 0), width - 1)

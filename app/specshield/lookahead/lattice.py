@@ -11,7 +11,7 @@ from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.caution.surprise.barred import NOTHING_BARRED
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import coordinates, find_corners, pose_of
+from specshield.policy.lattice import coordinates, find_corners, heading_count, pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -24,7 +24,6 @@ from specshield.policy.progress import (
 )
 from specshield.policy.reachability.guide import make_scratch
 from specshield.policy.reachability.tables import Guide, Tables, slack_at
-from specshield.policy.shape import heading_count
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 from specshield.stl.program import STACK_SIZE
 
@@ -38,7 +37,8 @@ Pose = tuple[float, float, float]
 
 
 class Planes(NamedTuple):
-    """The lattice and the formula's windows. Poses [H, N]: a padded plane of cells for each heading.
+    """The lattice for a robot on its map, and the formula's windows. Poses [H, N]: a padded plane of cells
+    for each heading.
 
     The lattice. pitch [m]; pad, width: of a plane, in cells. valid [H, N]: 1 where a pose is free; free [M,
     H, N]: 1 where a motion is not stopped short; row [N]: the place of a cell in a table of D, -1 where no
@@ -55,6 +55,7 @@ class Planes(NamedTuple):
     slots where there are no tables.
     """
 
+    body: Body
     pitch: float
     pad: int
     width: int
@@ -98,6 +99,7 @@ def make_planes(
     due = _bits(rules.a[steady], rules.b[steady], steady, horizon)
     opened = _bits(first, last, np.arange(len(goal)), horizon)
     planes = Planes(
+        body,
         pitch,
         pad,
         width,
@@ -115,7 +117,7 @@ def make_planes(
         np.full(cells, -1),
         np.zeros((0, *shape), np.uint8),
     )
-    _survey(body, rules, planes)
+    _survey(rules, planes)
     rooms = planes.valid.any(axis=0)
     planes.row[rooms] = np.arange(rooms.sum())
     entries = slots * headings * max(int(rooms.sum()), 1)
@@ -148,10 +150,10 @@ def _slots(first: Ints, last: Ints, horizon: int, every: int) -> Ints:
 
 
 @inlined
-def pose_at(body: Body, planes: Planes, h: int, c: int) -> Pose:
+def pose_at(planes: Planes, h: int, c: int) -> Pose:
     """The map-frame pose of cell c of the plane of heading h."""
     j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
-    return pose_of(body, planes.pitch, planes.valid.shape[0], j, i, h)
+    return pose_of(planes.body, planes.pitch, planes.valid.shape[0], j, i, h)
 
 
 @leaf
@@ -172,14 +174,14 @@ def blocked_at(body: Body, x: float, y: float, theta: float) -> Bools:
 
 
 @kernel
-def _survey(body: Body, rules: Rules, planes: Planes) -> None:
+def _survey(rules: Rules, planes: Planes) -> None:
     """Where poses are free, which motions are, and which predicates hold."""
     headings, cells = planes.valid.shape
     values, stack, read = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(rules.kind.shape[0])
     for h in range(headings):
         for c in range(cells):
-            x, y, theta = pose_at(body, planes, h, c)
-            if in_collision(body, x, y, theta):
+            x, y, theta = pose_at(planes, h, c)
+            if in_collision(planes.body, x, y, theta):
                 continue
             planes.valid[h, c] = 1
             read_predicates(rules, x, y, theta, values, stack, read)
@@ -187,7 +189,7 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
                 planes.holds[h, c] |= np.int32(read[planes.goal[g]] > rules.margin) << g
             for k in range(read.shape[0]):
                 planes.keeps[h, c] |= np.int32(read[k] > rules.margin) << k
-            planes.free[:, h, c] = ~blocked_at(body, x, y, theta)
+            planes.free[:, h, c] = ~blocked_at(planes.body, x, y, theta)
 
 
 @kernel
@@ -206,10 +208,10 @@ def _rule_out(guide: Guide, planes: Planes) -> None:
             for c in range(cells):
                 if planes.row[c] < 0:
                     continue
-                v, u, _ = coordinates(guide.body, tables.pitch, headings, *pose_at(guide.body, planes, 0, c))
+                v, u, _ = coordinates(guide.body, tables.pitch, headings, *pose_at(planes, 0, c))
                 known = find_corners(tables.cell, v, u, scratch.corners)  # the same for each heading
                 for h in range(headings):
                     if planes.valid[h, c]:
-                        x, y, theta = pose_at(guide.body, planes, h, c)
+                        x, y, theta = pose_at(planes, h, c)
                         left = slack_at(guide, x, y, theta, t, scratch, scratch.corners, known)
                         planes.possible[slot, h, c] = left >= 0.0

@@ -21,20 +21,20 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import block_diag
 
-from specshield.arrays import Bools, Codes, Floats, Ints
+from specshield.arrays import Bools, Floats, Ints
 from specshield.errors import Unsupported
 from specshield.lookahead import belief as beliefs
 from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, solve
-from specshield.lookahead.expansion import expand_all
+from specshield.lookahead.expansion import Bank, expand_all
 from specshield.lookahead.goals import Goals, make_goals
-from specshield.lookahead.lattice import Planes, make_planes
+from specshield.lookahead.lattice import make_planes
 from specshield.lookahead.preferences import AHEADS, PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
-from specshield.policy.progress import SETTLED, Rules, make_rules, replay
+from specshield.policy.progress import SETTLED, make_rules, replay
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.portable import exp, inner
-from specshield.robot.dynamics import Body, make_body
+from specshield.robot.dynamics import make_body
 from specshield.rule.values import signal_rows
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
@@ -54,21 +54,15 @@ WORST = 10.0  # [nats] D of actions that have none, above the worst action that 
 class LookAhead:
     """A task as the look-ahead sees it, prepared once.
 
-    leads [B]: the goals that have a table of D and, last, WANDER. shares [G + 1, B]: how much each of them
-    stands for each goal, and for wandering; a row sums to 1. tables [B, kept, H, rows]: codes of D.
+    shares [G + 1, B]: how much each stand-in stands for each goal, and for wandering; a row sums to 1.
     """
 
     task: Task
-    body: Body
-    rules: Rules
-    goals: Goals
-    planes: Planes
-    leads: Ints
+    bank: Bank
     shares: Floats
-    tables: Codes
 
     def begin(self) -> bytes:
-        return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions)).to_bytes()
+        return beliefs.begin(len(self.bank.goals.distance), len(self.task.robot.motions)).to_bytes()
 
     def step(
         self,
@@ -96,7 +90,7 @@ class LookAhead:
         end = float(prior[robot.terminal].sum())
         possible = float(prior[feasible & ~robot.terminal].sum()) / float(going_on.sum())
         forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
-        belief = beliefs.update(belief, self.body, self.goals, pose, said, end, max(forced, 0.0))
+        belief = beliefs.update(belief, self.bank.goals, pose, said, end, max(forced, 0.0))
         over = len(history) > self.task.horizon  # no motion changes what the rule says
         if over or belief.forced < FORCED or belief.trust < NEGLIGIBLE:
             return belief.to_bytes(), np.zeros(len(prior))
@@ -105,33 +99,20 @@ class LookAhead:
 
     def _costs(self, belief: Belief, history: Floats, signals: Mapping[str, Floats]) -> Floats:
         """D after each motion above the least of them, [M]: the mean over the likely stand-ins."""
-        t = len(history) - 1
-        rules = self.rules._replace(signals=self.rules.signals.copy())
+        t, bank = len(history) - 1, self.bank
+        rules = bank.rules._replace(signals=bank.rules.signals.copy())
         status, _ = replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1))
-        mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
+        mask = sum(1 << g for g, k in enumerate(bank.planes.goal) if status[k] == SETTLED)
         weights = inner(self.shares.T, belief.probabilities())
         asked = np.argsort(-weights, kind="stable")[:LEADERS]
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
-        expand_all(
-            self.body,
-            rules,
-            self.goals,
-            self.planes,
-            self.tables,
-            self.leads,
-            asked,
-            STYLE,
-            t,
-            mask,
-            history[-1],
-            costs,
-        )
+        expand_all(bank._replace(rules=rules), asked, STYLE, t, mask, history[-1], costs)
         known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
         # Most of D is the cost of bending the model, which is proportional to how sharp the model is.
-        sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
+        sharp = np.where(bank.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
         total = inner(np.where(known, costs, 0.0).T, weights[asked] / weights[asked].sum() * sharp)
         result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)
         return result
@@ -162,8 +143,8 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     shape = (len(leads), int(planes.kept.max()) + 1, len(planes.valid), int(planes.row.max()) + 1)
     tables = np.empty(shape, np.uint16)
     for table, lead in zip(tables, leads, strict=True):
-        table[:] = solve(body, planes, stand_in_for(body, goals, planes, int(lead), STYLE))
-    return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
+        table[:] = solve(planes, stand_in_for(goals, planes, int(lead), STYLE))
+    return LookAhead(task, Bank(rules, goals, planes, leads, tables), block_diag(shares, 1.0))
 
 
 PREFERENCE = PreferenceKind(

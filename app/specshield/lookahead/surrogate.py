@@ -34,21 +34,19 @@ LEAST_MOTION = 1e-9  # [m], [rad] the divisor for a robot without moves, or with
 
 
 @leaf
-def follow(
-    body: Body, goals: Goals, goal: int, style: Floats, pose: Pose, blocked: Bools, out: Floats
-) -> float:
+def follow(goals: Goals, goal: int, style: Floats, pose: Pose, blocked: Bools, out: Floats) -> float:
     """log r of each motion at a pose, into out (M,); returns the chance that the stand-in ends there.
 
     goal: or WANDER. style (FEATURES,): the logit of each feature. blocked (M,): the motions that an obstacle
     stops short.
     """
     if goal == WANDER:
-        _wander(body, blocked, out)
+        _wander(goals.body, blocked, out)
         return WANDER_END
-    row, column = cell_of(body, goals, pose[0], pose[1])
-    bearing = bearing_of(body, goals, goal, row, column, pose[2])
+    row, column = cell_of(goals, pose[0], pose[1])
+    bearing = bearing_of(goals, goal, row, column, pose[2])
     for m in range(out.shape[0]):
-        progress, turning, stopped, idle = features_of(body, bearing, m, blocked[m])
+        progress, turning, stopped, idle = features_of(goals.body, bearing, m, blocked[m])
         out[m] = style[0] * progress + style[1] * turning + style[2] * stopped + style[3] * idle
     _normalise(out)
     return end_chance(goals.distance[goal, row, column])
@@ -61,12 +59,12 @@ def end_chance(distance: int) -> float:
 
 
 @leaf
-def bearing_of(body: Body, goals: Goals, goal: int, row: int, column: int, theta: float) -> float:
+def bearing_of(goals: Goals, goal: int, row: int, column: int, theta: float) -> float:
     """The turn [rad] from the heading theta [rad] to the way in a cell of the grid; NaN at the goal."""
     wu, wv = float(goals.way[goal, row, column, 0]), float(goals.way[goal, row, column, 1])
     if wu == 0.0 and wv == 0.0:
         return math.nan
-    bearing = math.atan2(wv, wu) + math.atan2(body.sin_yaw, body.cos_yaw) - theta
+    bearing = math.atan2(wv, wu) + math.atan2(goals.body.sin_yaw, goals.body.cos_yaw) - theta
     return (bearing + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -124,12 +122,12 @@ def step_price(goal: int) -> float:
 
 
 @leaf
-def price_left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float:
+def price_left(goals: Goals, goal: int, x: float, y: float) -> float:
     """The price of the steps from (x, y) to where the stand-in ends [nats]; 0 where that cannot be told."""
     if goal == WANDER:
         return 0.0
-    row, column = cell_of(body, goals, x, y)
-    distance, (stride, _) = goals.distance[goal, row, column], _largest(body)
+    row, column = cell_of(goals, x, y)
+    distance, (stride, _) = goals.distance[goal, row, column], _largest(goals.body)
     if distance == NO_PATH or stride <= LEAST_MOTION:
         return 0.0
     return PRICE * max(float(distance) / 100.0 - END_WITHIN, 0.0) / stride
@@ -149,7 +147,7 @@ class StandIn(NamedTuple):
 
 
 @kernel
-def stand_in_for(body: Body, goals: Goals, planes: Planes, goal: int, style: Floats) -> StandIn:
+def stand_in_for(goals: Goals, planes: Planes, goal: int, style: Floats) -> StandIn:
     """The stand-in that goes to a goal, or WANDER, at each pose of the lattice."""
     (headings, cells), count = planes.valid.shape, planes.free.shape[0]
     motions = np.zeros((count, headings, cells), np.float32)
@@ -159,11 +157,11 @@ def stand_in_for(body: Body, goals: Goals, planes: Planes, goal: int, style: Flo
         for c in range(cells):
             if not planes.valid[h, c]:
                 continue
-            pose = pose_at(body, planes, h, c)
-            left[c] = price_left(body, goals, goal, pose[0], pose[1])
+            pose = pose_at(planes, h, c)
+            left[c] = price_left(goals, goal, pose[0], pose[1])
             for m in range(count):
                 blocked[m] = planes.free[m, h, c] == 0.0
-            ends[h, c] = follow(body, goals, goal, style, pose, blocked, log_r)
+            ends[h, c] = follow(goals, goal, style, pose, blocked, log_r)
             for m in range(count):
                 motions[m, h, c] = log_r[m]
     return StandIn(motions, ends, step_price(goal), left)

@@ -13,9 +13,9 @@ import numpy as np
 import scipy
 
 from specshield.arrays import Bools
+from specshield.policy.lattice import headings_of, side_of
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules, goals_of
 from specshield.policy.reachability.sight import look, reads
-from specshield.policy.shape import headings_of, side_of
 from specshield.robot.dynamics import Body, longest_motions, swing_radius
 from specshield.task import Task
 
@@ -27,15 +27,19 @@ MOST_STEPS = 40_000_000  # poses times motions, each of which takes up to 10 byt
 COARSEST = 4.0  # times the pitch that was asked for; beyond it doors are missed
 
 
+def pose_count(task: Task, pitch: float) -> int:
+    """The poses of a lattice of the whole map."""
+    ny, nx = side_of(task.grid, pitch)
+    return ny * nx * headings_of(task)
+
+
 def fitting_pitch(task: Task, pitch: float, entries: int, most: int, share: float = 1.0) -> float:
     """The smallest pitch, `pitch` or more [m], whose lattice is not too large. entries: of the tables, for
     each pose; most: how many entries there may be; share: of the map that the lattice covers. Callers refuse
     results beyond COARSEST.
     """
-    headings = headings_of(task)
     allowed = min(MOST_POSES, MOST_STEPS // len(task.robot.motions), most / entries)
-    ny, nx = side_of(task.grid, pitch)
-    poses = ny * nx * headings * share
+    poses = pose_count(task, pitch) * share
     if poses <= allowed:
         return pitch
     times = poses / allowed
@@ -62,9 +66,8 @@ def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bo
         _, heading, _ = reads(rules, int(k))
         if heading:
             continue
-        outer, inner = np.zeros((ny, nx, 1), np.bool_), np.zeros((ny, nx, 1), np.bool_)
         near = pitch + 2.0 * swing_radius(body)
-        look(body, rules, int(k), pitch, 4, np.full((ny, nx), True), np.zeros(1), near, outer, inner)
+        outer, _ = look(body, rules, int(k), pitch, 1, np.full((ny, nx), True), np.zeros(1), near)
         there = outer[..., 0]
         if there.any():
             first = rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.progress import Rules
-from specshield.policy.progress.values import fill_place, fill_signals
-from specshield.policy.shape import heading_count, side_of
+from specshield.policy.progress import Rules, fill_place, fill_signals
 from specshield.robot.body import in_grid
 from specshield.robot.dynamics import (
     TOUCH,
@@ -28,12 +26,13 @@ from specshield.robot.dynamics import (
     free_distance,
     in_collision,
     longest_motions,
-    step,
+    step_from,
     swing_radius,
-    unhindered,
 )
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import STACK_SIZE, VALUE, Programs, evaluate_packed
+from specshield.task import Task
+from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import PackedRegions, turns_with_robot
 
 STEP_CODES = 64.0  # codes of a step in a table of steps
@@ -42,6 +41,40 @@ NO_TIME = -1.0  # in place of a step, where there is none
 SMALL = 1_000_000  # poses of a lattice that one thread makes
 THREADS = 2  # that make a larger one: kernels let go of the interpreter's lock
 SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere (chosen by hand)
+MAX_HEADINGS = 120
+FEWEST_HEADINGS, USUAL_HEADINGS = 24, 72  # where none fits every turn exactly: 15 to 5 degrees each
+# [headings] How far a turn may be off a multiple of a heading to count as exact, and as nearly exact: ten
+# turns that are off by NEAR_HEADING make half a heading. Chosen by hand.
+SAME_HEADING, NEAR_HEADING = 1e-3, 0.05
+
+
+def heading_count(rotations: list[float]) -> int:
+    """The fewest headings, 4 to MAX_HEADINGS, of which every rotation [rad] is exactly a multiple.
+
+    If there are none, the fewest from FEWEST_HEADINGS on of which every rotation is nearly a multiple, else
+    USUAL_HEADINGS.
+    """
+
+    def error(n: int) -> float:
+        steps = np.array(rotations) * n / (2.0 * math.pi)
+        return float(np.abs(steps - np.round(steps)).max(initial=0.0))
+
+    for n in range(4, MAX_HEADINGS + 1):
+        if error(n) < SAME_HEADING:
+            return n
+    odd = range(FEWEST_HEADINGS, USUAL_HEADINGS + 1)
+    return next((n for n in odd if error(n) < NEAR_HEADING), USUAL_HEADINGS)
+
+
+def headings_of(task: Task) -> int:
+    """The headings of a task's lattice."""
+    return heading_count([turn for _, turn in task.robot.motions if turn != 0.0])
+
+
+def side_of(grid: OccupancyGrid | Body, pitch: float) -> tuple[int, int]:
+    """Rows and columns of a lattice on a map."""
+    ny, nx = (max(math.ceil(n * grid.resolution / pitch - 1e-9), 1) for n in grid.occupied.shape)
+    return ny, nx
 
 
 class Lattice(NamedTuple):
@@ -184,23 +217,6 @@ def bilinear(valid: Bytes, table: Singles, v: float, u: float, h: int) -> float:
 
 
 @inlined
-def coordinates_ahead(
-    body: Body, pitch: float, headings: int, x: float, y: float, theta: float
-) -> tuple[float, float, float, float, float]:
-    """A pose's lattice coordinates (v, u, h), and the cells that a metre ahead leads along v and u."""
-    v, u, h = coordinates(body, pitch, headings, x, y, theta)
-    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
-    return v, u, h, math.sin(grid_theta) / pitch, math.cos(grid_theta) / pitch
-
-
-@inlined
-def heading_after(headings: int, h: float, angle: float) -> float:
-    """The heading in [0, H) after a turn [rad]."""
-    w = h + angle * headings / (2.0 * math.pi)
-    return w if w >= 0.0 else w + headings
-
-
-@inlined
 def leads_back(body: Body, last: int, motion: int) -> bool:
     """Whether a motion goes or turns the other way than the one before; `last` is -1 for none."""
     if last < 0:
@@ -216,34 +232,28 @@ def _simulate_all(
 ) -> None:
     """Rows `first` to stop - 1."""
     _, nx, headings = lattice.valid.shape
-    turns_within = swing_radius(body) + TOUCH
-    moves_within = turns_within + longest_motions(body)[0]
+    offset = swing_radius(body) - body.radius
+    farthest = body.radius + longest_motions(body)[0] + 3.0 * offset + 2.0 * TOUCH  # that any motion reaches
     for j in range(first, stop):
         for i in range(nx):
             if not cells[j, i]:
                 continue
             u, v = (i + 0.5) * lattice.pitch, (j + 0.5) * lattice.pitch
-            room = free_distance(body, u, v, moves_within)
+            room = free_distance(body, u, v, farthest) - offset  # around the footprint's centre, at least
             for h in range(headings):
                 x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                if room < turns_within and in_collision(body, x, y, theta):
+                if room < body.radius + TOUCH and in_collision(body, x, y, theta):
                     continue
                 lattice.valid[j, i, h] = 1
                 cos, sin = math.cos(theta), math.sin(theta)
                 for d in range(moving.shape[0]):
-                    if room >= moves_within:
-                        x1, y1, theta1 = unhindered(body, x, y, theta, cos, sin, moving[d])
-                    else:
-                        x1, y1, theta1 = step(body, x, y, theta, moving[d])
+                    x1, y1, theta1 = step_from(body, x, y, theta, cos, sin, room, moving[d])
                     if x1 != x or y1 != y or theta1 != theta:
                         v, u, w = coordinates(body, lattice.pitch, headings, x1, y1, theta1)
                         lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d] = u, v
                         lattice.far_h[j, i, h, d] = round(w) % headings
                 for r in range(turning.shape[0]):
-                    if room >= turns_within:
-                        _, _, theta1 = unhindered(body, x, y, theta, cos, sin, turning[r])
-                    else:
-                        _, _, theta1 = step(body, x, y, theta, turning[r])
+                    _, _, theta1 = step_from(body, x, y, theta, cos, sin, room, turning[r])
                     lattice.turns[j, i, h, r] = theta1 != theta
 
 

@@ -10,6 +10,8 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 
+DEGREE = 180.0 / math.pi  # `Grain.turn` for headings that are the same to a degree
+
 
 class Heap(NamedTuple):
     """A binary heap in arrays, the least rank first. row [N]: the rows in it; rank [N]: of each. What follows
@@ -35,6 +37,16 @@ class Tree(NamedTuple):
     motion: Int32s
     heap: Heap
     table: Int32s
+
+
+class Grain(NamedTuple):
+    """Poses are nearly the same whose x, times `scale` [1/m] over `size`, round down to the same number, as
+    their y do, and whose headings, times `turn` [1/rad], round to the same.
+    """
+
+    scale: float
+    size: float
+    turn: float
 
 
 @inlined
@@ -68,43 +80,34 @@ def put(tree: Tree, row: int, x: float, y: float, theta: float, made: int, paren
     tree.made[row], tree.parent[row], tree.motion[row] = made, parent, motion
 
 
-@inlined
-def first_slot(tree: Tree, key: int) -> int:
-    """Where in the table to look first for what has this key."""
-    return int((key ^ key >> 15) & (tree.table.shape[0] - 1))
-
-
 @leaf
-def is_new(tree: Tree, row: int, grain: float, sooner: bool) -> bool:
-    """Whether no row in the table has nearly the same pose and the same progress; if `sooner`, none that was
-    reached in as few motions either. The row is then put into the table.
+def enter(tree: Tree, row: int, grain: Grain, sooner: bool) -> int:
+    """Puts a row into the table and returns its slot; -1 if an earlier row has nearly the same pose and the
+    same progress and, if `sooner`, was reached in as few motions. Only rows of one grain are compared.
 
-    grain: poses that differ by less [m], and by less than a degree, are nearly the same. Only rows with the
-    same grain are compared.
+    Until the next row is put, it is the last of its chain: -1 in its slot takes it out again.
     """
     x, y, h = _rounded(tree.pose, row, grain)
     key = x * 73856093 ^ y * 19349663 ^ h * 83492791
     for k in range(tree.status.shape[1]):
         key = key * 31 + tree.status[row, k]
-    slot = first_slot(tree, key)
+    slot = (key ^ key >> 15) & (tree.table.shape[0] - 1)
     while tree.table[slot] >= 0:
         other = tree.table[slot]
         same = _rounded(tree.pose, other, grain) == (x, y, h)
         for k in range(tree.status.shape[1]):
             same = same and tree.status[row, k] == tree.status[other, k]
         if same and not (sooner and tree.made[row] < tree.made[other]):
-            return False
-        if same:
-            break
+            return -1
         slot = (slot + 1) & (tree.table.shape[0] - 1)
     tree.table[slot] = row
-    return True
+    return int(slot)
 
 
-@leaf
-def _rounded(pose: Floats, row: int, grain: float) -> tuple[int, int, int]:
-    x, y, h = pose[row, 0] / grain, pose[row, 1] / grain, math.degrees(pose[row, 2])
-    return math.floor(x), math.floor(y), math.floor(h + 0.5)
+@inlined
+def _rounded(pose: Floats, row: int, grain: Grain) -> tuple[int, int, int]:
+    x, y = pose[row, 0] * grain.scale / grain.size, pose[row, 1] * grain.scale / grain.size
+    return math.floor(x), math.floor(y), math.floor(pose[row, 2] * grain.turn + 0.5)
 
 
 @leaf

@@ -28,8 +28,7 @@ from specshield.caution.surprise.barred import NOTHING_BARRED
 from specshield.caution.surprise.contact import cells_met
 from specshield.compiled import box
 from specshield.policy.lattice import Lattice
-from specshield.policy.progress import make_rules
-from specshield.policy.progress.recall import Past
+from specshield.policy.progress import Past, make_rules
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import go_around
 from specshield.policy.reachability.latest import sweep

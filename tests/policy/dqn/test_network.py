@@ -20,11 +20,11 @@ def test_a_tiny_network_by_hand():
     weights = arrays([[1, -1], [2, 0]], [0, 1], [[1, 0.5], [3, 3]], [-1, 0], [[1, 0], [-1, 2]], [0, 0.5])
     net = make_network(weights, 2, 2)
     layers = make_layers(net)
-    assert greedy(net, np.array([2, 1], np.float32), layers) == 1
+    assert greedy(layers, np.array([2, 1], np.float32)) == 1
     assert layers.h1.tolist() == [4.0, 0.0]  # [2 + 2, -2 + 1], not below 0
     assert layers.h2.tolist() == [3.0, 2.0]  # [4 - 1, 2]
     assert layers.q.tolist() == [1.0, 4.5]  # [3 - 2, 4 + 0.5]
-    assert greedy(net, np.array([-1, 0], np.float32), layers) == 1
+    assert greedy(layers, np.array([-1, 0], np.float32)) == 1
     assert layers.h1.tolist() == [0.0, 2.0]
     assert layers.h2.tolist() == [5.0, 6.0]
     assert layers.q.tolist() == [-1.0, 12.5]
@@ -37,8 +37,8 @@ def test_every_sum_is_made_in_the_order_of_its_inputs():
         shapes = ((inputs, first), first, (first, second), second, (second, outputs), outputs)
         weights = arrays(*(random.normal(0, 1, shape) for shape in shapes))
         x = random.normal(0, 1, inputs).astype(np.float32)
-        layers = make_layers(net := make_network(weights, inputs, outputs))
-        best, expected = greedy(net, x, layers), x
+        layers = make_layers(make_network(weights, inputs, outputs))
+        best, expected = greedy(layers, x), x
         for i, layer in enumerate((layers.h1, layers.h2, layers.q), start=1):
             total = weights[f"b{i}"].copy()
             for value, row in zip(expected, weights[f"w{i}"], strict=True):
@@ -50,7 +50,7 @@ def test_every_sum_is_made_in_the_order_of_its_inputs():
 
 def test_the_lowest_index_wins_ties():
     net = make_network(arrays([[0]], [0], [[0]], [0], [[0, 0, 0]], [1, 2, 2]), 1, 3)
-    assert greedy(net, np.ones(1, np.float32), make_layers(net)) == 1
+    assert greedy(make_layers(net), np.ones(1, np.float32)) == 1
 
 
 def forward(weights, x):
@@ -70,7 +70,7 @@ def test_numpy_and_torch_agree():
     for _ in range(200):
         x = random.normal(0, 1, inputs).astype(np.float32)
         x[random.random(len(x)) < 0.3] = 0.0
-        best, expected = greedy(net, x, layers), forward(weights, x)
+        best, expected = greedy(layers, x), forward(weights, x)
         assert best == np.argmax(expected)
         np.testing.assert_allclose(layers.q, expected, atol=1e-4)
         with torch.no_grad():

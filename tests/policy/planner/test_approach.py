@@ -51,7 +51,7 @@ def test_what_has_to_hold_is_asked_for_in_its_steps_alone(corridor):
 def test_one_step_of_a_beam_keeps_the_poses_by_their_steps_to_go(corridor):
     cells, world, way = corridor
     k = literal_of(cells, "A", 1)
-    n = descend_by_beam(world, way, k, world.field[k, 0], 0, 14, np.inf, 1, 1, nothing_needed(world))
+    n = descend_by_beam(world, way, k, world.field[k, 0], 0, 14, np.inf, (1, 1), nothing_needed(world))
     assert n == 1
     assert way.motions[0] == FORWARD
     assert way.places[1, :3, 3].tolist() == [3.0, 5.0, 5.0]  # ahead; a turn, which has to be turned back
@@ -61,16 +61,16 @@ def test_one_step_of_a_beam_keeps_the_poses_by_their_steps_to_go(corridor):
 def test_a_beam_arrives_where_the_literal_holds(corridor):
     cells, world, way = corridor
     k = literal_of(cells, "A", 1)
-    assert descend_by_beam(world, way, k, world.field[k, 0], 0, 14, 0.0, 0, 14, nothing_needed(world)) == 4
+    assert descend_by_beam(world, way, k, world.field[k, 0], 0, 14, 0.0, (0, 14), nothing_needed(world)) == 4
     assert way.motions[:4].tolist() == [FORWARD] * 4
-    assert descend_by_beam(world, way, k, world.field[k, 0], 0, 3, 0.0, 0, 14, nothing_needed(world)) == -1
+    assert descend_by_beam(world, way, k, world.field[k, 0], 0, 3, 0.0, (0, 14), nothing_needed(world)) == -1
 
 
 def test_a_beam_keeps_one_of_two_poses_that_are_alike():
     places, trail = np.zeros((12, 4)), np.zeros((12, 2), np.int64)
-    kept = _insert(places, trail, 0, 1.0, 1.0, 0.0, 5.0, 0, 3)
-    kept = _insert(places, trail, kept, 2.0, 1.0, 0.0, 4.0, 1, 2)  # nearer: goes first
-    kept = _insert(places, trail, kept, 1.0, 1.01, 0.0, 1.0, 2, 1)  # like the first one
+    kept = _insert(places, trail, 0, (1.0, 1.0, 0.0, 5.0), (0, 3))
+    kept = _insert(places, trail, kept, (2.0, 1.0, 0.0, 4.0), (1, 2))  # nearer: goes first
+    kept = _insert(places, trail, kept, (1.0, 1.01, 0.0, 1.0), (2, 1))  # like the first one
     assert kept == 2
     assert places[:2].tolist() == [[2.0, 1.0, 0.0, 4.0], [1.0, 1.0, 0.0, 5.0]]
     assert trail[:2].tolist() == [[1, 2], [0, 3]]

@@ -1,5 +1,6 @@
 """What descending the fields does not find: starts near a deadline, and narrow places."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,13 @@ import pytest
 
 from benchmarks import deadlines
 from specshield.episode import decide, make_shield, start
+from specshield.policy.planner.due_dates import NO_DATE
+from specshield.policy.planner.exact import _reach
+from specshield.policy.planner.first_motions import make_way
 from specshield.policy.planner.policy import Settings, synthesise
-from specshield.robot import STRETCH
+from specshield.policy.planner.way import BEGIN, UNTIL
+from specshield.policy.tree import make_tree
+from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
 from specshield.task import make_task
@@ -86,3 +92,23 @@ def test_what_a_signal_forbids_when_a_policy_is_made_bars_no_way_once_it_allows_
             assert [j == 1.0 for j in decision.j_values[:4]] == expected.tolist()
             some += expected.any()
     assert some > 20
+
+
+def test_poses_that_break_the_rule_take_no_room():
+    """From the middle of a place that is not to be left 38 of 40 motions lead out of it. The search makes 64
+    poses, of which the table has room for twice as many, and turns on the spot: it ends without a way.
+    """
+    leaving = [{"name": f"m{n}", "translate": 1.0 + 0.025 * n} for n in range(38)]
+    turns = [{"name": f"t{n}", "rotate": n * math.radians(6.0)} for n in (1, -1)]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": leaving + turns})
+    regions = {"Home": {"type": "circle", "center": [2.45, 2.45], "radius": 0.5}}
+    regions |= {"Dock": {"type": "circle", "center": [4.4, 4.4], "radius": 0.3}}
+    task = make_task(ROOM, robot, "F[0,60] Dock and F[0,60] Home", regions)
+    world = synthesise(task, Settings(pitch=0.3))._world
+    way, tree, need = make_way(world, 0, 60, np.empty(0)), make_tree(64, 0), np.full((2, 4), -1, np.int64)
+    way.poses[0] = 2.45, 2.45, 0.0
+    need[:, BEGIN], need[1, BEGIN], need[1, UNTIL] = NO_DATE, 0, 60
+    length, made = _reach(world, way, 0, world.field[0, 0], 0, 60, need, tree, 64, 0.03)
+    assert length == -1
+    assert made > 20
+    assert (tree.table >= 0).sum() == made - 1  # all but x_t

@@ -10,7 +10,7 @@ from specshield.policy.planner.literals import literals_of
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.policy import synthesise
 from specshield.policy.planner.way import BEGIN, DUE, UNTIL, UNTIL_GOAL, read_at
-from specshield.policy.progress.values import initial_signals
+from specshield.policy.progress import initial_signals
 from tests.oracles.cells import MOTIONS, Cells
 
 PLACES = {"A": (0, 4), "B": (2, 1), "C": (0, 2)}  # column and row

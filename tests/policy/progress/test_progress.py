@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from specshield.errors import FragmentError
-from specshield.policy.progress import BROKEN, PENDING, SETTLED, make_rules, replay
-from specshield.policy.progress.recall import Past, pasts, recall
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past, make_rules, pasts, recall, replay
 from specshield.robot import STRETCH
 from specshield.rule.values import signal_rows
 from specshield.task import make_task

@@ -7,13 +7,12 @@ import pytest
 
 from specshield.caution.surprise.barred import NOTHING_BARRED, in_vain
 from specshield.compiled import box
-from specshield.policy.progress import PENDING, SETTLED, make_rules
-from specshield.policy.progress.recall import pasts
+from specshield.policy.progress import PENDING, SETTLED, make_rules, pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells, spare_on
-from specshield.policy.reachability.around.search import GAVE_UP, NO_WAY, POSES, _slot_of, go_around
+from specshield.policy.reachability.around.search import GAVE_UP, GRAIN, NO_WAY, POSES, go_around
 from specshield.policy.reachability.policy import synthesise
 from specshield.policy.reachability.tables import Guide
-from specshield.policy.tree import make_tree
+from specshield.policy.tree import enter, make_tree
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
@@ -30,7 +29,7 @@ def test_poses_that_are_turned_away_take_no_room_and_hide_nothing():
     for _ in range(20 * rows):  # ten times what the table holds
         pose = random.uniform(0.0, 20.0, 3)
         tree.pose[count] = pose
-        slot = _slot_of(tree, count)
+        slot = enter(tree, count, GRAIN, True)
         if slot < 0:
             continue
         assert tree.table[slot] == count
@@ -43,7 +42,7 @@ def test_poses_that_are_turned_away_take_no_room_and_hide_nothing():
     assert (tree.table >= 0).sum() == count
     for pose in kept:  # none of those that were kept is new
         tree.pose[count] = pose
-        assert _slot_of(tree, count) < 0
+        assert enter(tree, count, GRAIN, True) < 0
 
 
 def test_where_a_search_on_one_of_several_maps_gives_up_nothing_else_is_tried():

@@ -34,20 +34,24 @@ def test_the_digits_of_the_progress():
     assert state_count(rules) == 10
 
 
+def after_each(formula, t, holds):
+    """The progress after step t, by that before it, where A holds (1) or does not (0)."""
+    rules = make_rules(make_corridor(formula, RESTLESS, A=1))
+    return transitions(rules, *digits_of(rules), state_count(rules), t, holds)
+
+
 def test_how_a_visit_changes():
-    rules = make_rules(make_corridor("F[2,4] A", RESTLESS, A=1))
-    assert transitions(rules, 1, 1).tolist() == [0, 1]  # too soon
-    assert transitions(rules, 2, 1).tolist() == [1, 1]
-    assert transitions(rules, 2, 0).tolist() == [0, 1]
-    assert transitions(rules, 4, 0).tolist() == [BROKEN_STATE, 1]  # too late
+    assert after_each("F[2,4] A", 1, 1).tolist() == [0, 1]  # too soon
+    assert after_each("F[2,4] A", 2, 1).tolist() == [1, 1]
+    assert after_each("F[2,4] A", 2, 0).tolist() == [0, 1]
+    assert after_each("F[2,4] A", 4, 0).tolist() == [BROKEN_STATE, 1]  # too late
 
 
 def test_how_a_dwell_changes():
     """F[0,2] G[0,1] A: two steps in A, begun by step 2; digits 0, 1, 2, and 3 once settled."""
-    rules = make_rules(make_corridor("F[0,2] G[0,1] A", RESTLESS, A=1))
-    assert transitions(rules, 0, 1)[[0, 3]].tolist() == [1, 3]
-    assert transitions(rules, 1, 1)[[0, 1, 3]].tolist() == [1, 3, 3]
-    assert transitions(rules, 2, 0)[[0, 1, 3]].tolist() == [BROKEN_STATE, BROKEN_STATE, 3]
+    assert after_each("F[0,2] G[0,1] A", 0, 1)[[0, 3]].tolist() == [1, 3]
+    assert after_each("F[0,2] G[0,1] A", 1, 1)[[0, 1, 3]].tolist() == [1, 3, 3]
+    assert after_each("F[0,2] G[0,1] A", 2, 0)[[0, 1, 3]].tolist() == [BROKEN_STATE, BROKEN_STATE, 3]
 
 
 def test_the_steps_at_which_a_corridor_is_feasible():

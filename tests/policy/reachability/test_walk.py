@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +9,13 @@ import pytest
 
 from specshield.compiled import box
 from specshield.policy.lattice import STEP_CODES
-from specshield.policy.progress import BROKEN, PENDING, SETTLED
-from specshield.policy.progress.recall import Past
-from specshield.policy.reachability.beam import beam_search
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past
+from specshield.policy.reachability.beam import Terms, beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
-from specshield.policy.reachability.search import continue_all
+from specshield.policy.reachability.search import begin, continue_all, go_back
 from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
-from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
+from specshield.policy.reachability.walk import SETTLED_ALL, climb
 from specshield.robot.dynamics import motion_count, step, successors
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
@@ -79,8 +77,7 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
 
 
 def scored(guide, where, t, scratch, last=-1, some=(0, 1)):
-    x, y, theta = where
-    score(guide, x, y, theta, math.cos(theta), math.sin(theta), t, last, some, scratch)
+    score(guide, *where, t, last, some, scratch)
     return scratch.scores.tolist()
 
 
@@ -141,19 +138,23 @@ def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
     base, led, scratch = begun(visit, pose(4), FORWARD)
     climb(visit, 0, 1, base, led, scratch, True)
     assert base.tolist() == [FORWARD, FORWARD] + [WAIT] * 8
-    motions, poses, scratch = begun(visit, pose(3, 1), LEFT)
-    assert rejoin(visit, 0, RIGHT, -1, base, led, 0, motions, poses, scratch)
-    assert motions.tolist() == [LEFT, RIGHT, FORWARD, FORWARD] + [WAIT] * 6
-    np.testing.assert_allclose(poses[3], pose(5))
+    motions, poses = np.empty((4, 10), np.int64), np.empty((4, 10, 3))
+    starts = begin(visit, past_at(3), every(4)[0], motions, poses)
+    assert go_back(visit, LEFT, base, led, starts)
+    assert motions[LEFT].tolist() == [LEFT, RIGHT, FORWARD, FORWARD] + [WAIT] * 6
+    np.testing.assert_allclose(poses[LEFT, 3], pose(5))
+
+
+def beam_from(guide, t, roots, steps, terms):
+    """The ways of a beam from poses at step t, with nothing settled."""
+    status, run = np.full((len(roots), 1), PENDING, np.int8), np.zeros((len(roots), 1), np.int64)
+    return beam_search(guide, t, roots, status, run, steps, terms, make_scratch(guide.rules, 4))
 
 
 def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
     """One root is a cell before A and faces it, the other faces north; a beam from step 6 has four steps."""
     roots = np.array([pose(4), pose(4, 1)])
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((2, 4), -1), np.zeros(2, np.int64)
-    status, run = np.full((2, 1), PENDING, np.int8), np.zeros((2, 1), np.int64)
-    beam_search(visit, 6, roots, status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
+    motions, taken = beam_from(visit, 6, roots, 4, Terms(4, 0.0, np.inf, 1))
     assert taken.tolist() == [1, 2]
     assert motions[0, 0] == FORWARD
     assert motions[1, :2].tolist() == [RIGHT, FORWARD]
@@ -161,18 +162,12 @@ def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
 
 def test_a_beam_that_looks_at_one_motion_in_two_looks_at_the_others_a_step_later(visit):
     """Two cells before A: it goes on, waits where it does not look at going on, and goes on then."""
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((1, 5), -1), np.zeros(1, np.int64)
-    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
-    beam_search(visit, 5, pose(3)[None], status, run, 2, 0.0, np.inf, 2, scratch, motions, taken)
+    motions, taken = beam_from(visit, 5, pose(3)[None], 5, Terms(2, 0.0, np.inf, 2))
     assert motions[0, : taken[0]].tolist() == [FORWARD, WAIT, FORWARD]
 
 
 def test_a_beam_gives_up_what_comes_too_late(visit):
-    scratch = make_scratch(visit.rules, 4)
-    motions, taken = np.full((1, 1), -1), np.zeros(1, np.int64)
-    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
-    beam_search(visit, 9, pose(3)[None], status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
+    _, taken = beam_from(visit, 9, pose(3)[None], 1, Terms(4, 0.0, np.inf, 1))
     assert taken.tolist() == [0]
 
 

@@ -67,9 +67,7 @@ class Environment:
         midway = self.random.random(n) >= FROM_THE_START
         times = np.where(midway, self.random.integers(0, self.task.horizon, n), 0)
         chance = self.random.random((n, k))
-        rewards, ended = np.zeros(n, np.float32), np.zeros(n, np.bool_)
-        _step_all(self.scene, self.funnels, self.robots, motions, fresh, times, chance, rewards, ended)
-        return rewards, ended
+        return _step_all(self.scene, self.funnels, self.robots, motions, fresh, times, chance)
 
 
 def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> Floats:
@@ -122,18 +120,11 @@ def begin_episode(rules: Rules, t: int, chance: Floats, state: State) -> None:
 
 @kernel
 def _step_all(
-    scene: Scene,
-    funnels: Funnels,
-    robots: Robots,
-    motions: Ints,
-    fresh: Floats,
-    times: Ints,
-    chance: Floats,
-    rewards: Singles,
-    ended: Bools,
-) -> None:
-    """One step of every robot. fresh (N, 3), times (N,), chance (N, K): where a new episode would begin."""
+    scene: Scene, funnels: Funnels, robots: Robots, motions: Ints, fresh: Floats, times: Ints, chance: Floats
+) -> tuple[Singles, Bools]:
+    """`Environment.step`. fresh (N, 3), times (N,), chance (N, K): where a new episode would begin."""
     rules, t = scene.rules, robots.t
+    rewards, ended = np.zeros(t.shape[0], np.float32), np.zeros(t.shape[0], np.bool_)
     scratch = make_state(scene, robots.observation.shape[1])
     for i in range(t.shape[0]):
         state = State(
@@ -171,3 +162,4 @@ def _step_all(
                 t[i] = scene.horizon
         successors(scene.body, state.pose, state.nexts)
         observe(scene, t[i], state)
+    return rewards, ended

@@ -40,8 +40,9 @@ class Network(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """What the network computed last: both hidden layers, and q [M], the value of each motion."""
+    """A network and what it computed last: both hidden layers, and q [M], the value of each motion."""
 
+    net: Network
     h1: Singles
     h2: Singles
     q: Singles
@@ -81,12 +82,13 @@ def _roomy(array: NDArray[np.generic]) -> Singles:
 def make_layers(net: Network) -> Layers:
     h1, h2, h3 = net.b1.shape[0], net.b2.shape[0], net.b3.shape[0]
     room = np.empty((3, max(h1, h2, h3) + FEW), np.float32)
-    return Layers(room[0, :h1], room[1, :h2], room[2, :h3])
+    return Layers(net, room[0, :h1], room[1, :h2], room[2, :h3])
 
 
 @leaf
-def greedy(net: Network, observation: Singles, layers: Layers) -> int:
-    """argmax_a Q(observation, a), the lowest index on ties. Overwrites `layers`."""
+def greedy(layers: Layers, observation: Singles) -> int:
+    """argmax_a Q(observation, a), the lowest index on ties. Overwrites what was computed last."""
+    net = layers.net
     _layer(observation, net.w1, net.b1, layers.h1)
     _relu(layers.h1)
     _layer(layers.h1, net.w2, net.b2, layers.h2)

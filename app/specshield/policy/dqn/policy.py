@@ -18,8 +18,7 @@ from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.rollout import propose_all
 from specshield.policy.dqn.scene import Scene, make_scene
-from specshield.policy.progress import make_rules
-from specshield.policy.progress.recall import pasts
+from specshield.policy.progress import make_rules, pasts
 from specshield.policy.tensors import read_tensors
 from specshield.policy.undo import undoing_motions
 from specshield.robot.dynamics import Body, make_body, motion_count

@@ -10,8 +10,7 @@ from specshield.policy.detour import copy_ways, find_sibling, find_twins, is_sam
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
 from specshield.policy.dqn.observation import State, arrive, make_state, observe, outcome, place
 from specshield.policy.dqn.scene import Scene
-from specshield.policy.progress import BROKEN, PENDING, SETTLED, Rules, advance
-from specshield.policy.progress.recall import Past, Present, recall
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Past, Present, Rules, advance, recall
 from specshield.robot.dynamics import motion_count, step, successors
 
 
@@ -25,15 +24,7 @@ def _begin(rules: Rules, now: Present, state: State) -> None:
 
 @leaf
 def _follow(
-    scene: Scene,
-    net: Network,
-    layers: Layers,
-    t: int,
-    first: int,
-    state: State,
-    motions: Ints,
-    poses: Floats,
-    whole: bool,
+    scene: Scene, layers: Layers, t: int, first: int, state: State, motions: Ints, poses: Floats, whole: bool
 ) -> int:
     """Follows pi_phi from `state` at step t to the horizon and returns the outcome there.
 
@@ -53,7 +44,7 @@ def _follow(
             if not known:
                 successors(scene.body, state.pose, state.nexts)
             observe(scene, t + k, state)
-            motion = greedy(net, state.observation, layers)
+            motion = greedy(layers, state.observation)
             x, y, theta = state.nexts[motion, 0], state.nexts[motion, 1], state.nexts[motion, 2]
             known = True
         known = not arrive(scene.rules, t + k + 1, x, y, theta, state) and known
@@ -109,7 +100,7 @@ def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: 
     state, layers = make_state(scene, net.w1.shape[0]), make_layers(net)
     poses = np.empty((*motions.shape, 3))
     _begin(scene.rules, now, state)
-    _follow(scene, net, layers, t, -1, state, motions[0, :1], poses[0, :1], True)
+    _follow(scene, layers, t, -1, state, motions[0, :1], poses[0, :1], True)
     preferred, base, ways = motions[0, 0], -1, 0
     for m in range(motions.shape[0]):
         x, y, theta = step(scene.body, now.pose[0], now.pose[1], now.pose[2], m)
@@ -141,7 +132,7 @@ def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: 
         if reached != SETTLED:
             _begin(scene.rules, now, state)
             row = own if joins else motions[m]
-            reached = _follow(scene, net, layers, t, m, state, row, poses[m], not joins)
+            reached = _follow(scene, layers, t, m, state, row, poses[m], not joins)
             if reached == SETTLED:
                 copy_row(row, motions[m])
                 known[ways] = m
@@ -171,7 +162,7 @@ def satisfies(scene: Scene, net: Network, starts: Floats, first: bool) -> Bools:
         advance(scene.rules, 0, state.predicates, status, run)
         for m in range(-1, motion_count(scene.body) if first else 0):
             _begin(scene.rules, now, state)
-            if _follow(scene, net, layers, 0, m, state, motions, poses, True) == SETTLED:
+            if _follow(scene, layers, 0, m, state, motions, poses, True) == SETTLED:
                 out[i] = True
                 break
     return out

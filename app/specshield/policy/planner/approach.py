@@ -9,12 +9,12 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, leaf
-from specshield.policy.lattice import SHORTEST_MOVE
+from specshield.policy.lattice import SHORTEST_MOVE, leads_back
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
 from specshield.policy.planner.way import Way, World, holds, keeps, lead, move, note_at, read_at, stay
-from specshield.robot.dynamics import displacement, motion_count
+from specshield.robot.dynamics import motion_count
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
@@ -25,6 +25,9 @@ DETOUR_GAIN = 2.0  # [steps] nearer than where the descent was stuck: what such 
 BEAM_WIDTH = 12  # poses that a beam keeps at a step
 BEAM_LENGTH = 64  # [steps] of a beam, at most
 SAME_POSE = 0.05  # [m + rad] poses that differ by less than this count once in a beam
+
+Place = tuple[float, float, float, float]
+Pair = tuple[int, int]
 
 
 @inlined
@@ -42,7 +45,7 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
             detours += 1
             best = to_go_at(body, world.fields, f, poses[best_n, 0], poses[best_n, 1], poses[best_n, 2])
             enough = max(best - DETOUR_GAIN, 0.0)
-            n = descend_by_beam(world, way, k, f, best_n, stop, enough, 0, DETOUR_LENGTH, need)
+            n = descend_by_beam(world, way, k, f, best_n, stop, enough, (0, DETOUR_LENGTH), need)
             if n < 0 or detours == DETOURS:
                 return -1
             x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
@@ -56,11 +59,8 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
         to_go_after(body, world.fields, f, x, y, theta, last, scores)
         barred = False  # whether a motion that leads down would break what has to hold
         while True:
-            m = world.pad if barred and waits else 0
-            for i in range(scores.shape[0]):
-                if scores[i] < scores[m] and not (barred and waits):
-                    m = i
-            padding = not scores[m] < OUT_OF_REACH
+            m = int(np.argmin(scores))
+            padding = (barred and waits) or not scores[m] < OUT_OF_REACH
             m = world.pad if padding else m
             if padding and not barred:
                 break
@@ -95,21 +95,13 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
 
 @leaf
 def descend_by_beam(
-    world: World,
-    way: Way,
-    k: int,
-    f: int,
-    n: int,
-    stop: int,
-    enough: float,
-    shortest: int,
-    longest: int,
-    need: Ints,
+    world: World, way: Way, k: int, f: int, n: int, stop: int, enough: float, length: Pair, need: Ints
 ) -> int:
     """Goes on from motions[:n] by a beam down field f, to fewer steps to go than `enough` or to where literal
-    k holds, after `shortest` to `longest` steps. The other arguments and the result are those of `descend`.
+    k holds. length: the fewest and the most steps of the beam. The other arguments and the result are those
+    of `descend`.
     """
-    body, places, trail = world.body, way.places, way.trail
+    body, places, trail, (shortest, longest) = world.body, way.places, way.trail, length
     copy_row(way.poses[n], places[0, 0])
     trail[0, 0, 1] = -1
     count = 1
@@ -117,15 +109,10 @@ def descend_by_beam(
         kept = 0
         way.spent[0] += 3.0 * count
         for w in range(count):
-            last = trail[i - 1, w, 1]
-            moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
-            if shortest > 0:
-                moved = turned = 0.0  # there is time, so it may go to and fro
+            last = trail[i - 1, w, 1] if shortest == 0 else -1  # if there is time, it may go to and fro
             before = places[i - 1, w]
             for m in range(motion_count(body)):
-                d, angle = displacement(body, m)
-                back = d * moved < 0.0 or angle * turned < 0.0
-                if back or (m == world.pad and world.stands):
+                if leads_back(body, last, m) or (m == world.pad and world.stands):
                     continue
                 x, y, theta = lead(world, before[0], before[1], before[2], m)
                 led = abs(x - before[0]) + abs(y - before[1]) > SHORTEST_MOVE or theta != before[2]
@@ -139,7 +126,7 @@ def descend_by_beam(
                     continue
                 if holds(world, k, way.rho):
                     ahead = -1.0 - abs(way.rho[world.literals.literal[k, PREDICATE]])
-                kept = _insert(places[i], trail[i], kept, x, y, theta, ahead, w, m)
+                kept = _insert(places[i], trail[i], kept, (x, y, theta, ahead), (w, m))
         if kept == 0:
             return -1
         if i >= shortest and places[i, 0, 3] < enough:
@@ -150,20 +137,12 @@ def descend_by_beam(
 
 
 @leaf
-def _insert(
-    places: Floats,
-    trail: Ints,
-    kept: int,
-    x: float,
-    y: float,
-    theta: float,
-    ahead: float,
-    parent: int,
-    motion: int,
-) -> int:
-    """Puts a pose among the `kept` poses of a beam's step, in the order of the steps to go, unless one of
-    them is the same; returns how many there are then. places [width, 4], trail [width, 2].
+def _insert(places: Floats, trail: Ints, kept: int, place: Place, link: Pair) -> int:
+    """Puts a place among the `kept` ones of a beam's step, in the order of the steps to go, unless one of
+    them has the same pose; returns how many there are then. places [width, 4], trail [width, 2], and one row
+    of each: `place` and `link`.
     """
+    x, y, theta, ahead = place
     for w in range(kept):
         if abs(places[w, 0] - x) + abs(places[w, 1] - y) + abs(places[w, 2] - theta) < SAME_POSE:
             return kept
@@ -172,8 +151,8 @@ def _insert(
         copy_row(places[at - 1], places[at])
         copy_row(trail[at - 1], trail[at])
         at -= 1
-    places[at, 0], places[at, 1], places[at, 2], places[at, 3] = x, y, theta, ahead
-    trail[at, 0], trail[at, 1] = parent, motion
+    places[at, 0], places[at, 1], places[at, 2], places[at, 3] = place
+    trail[at, 0], trail[at, 1] = link
     return min(kept + 1, BEAM_WIDTH)
 
 
@@ -208,7 +187,7 @@ def linger(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> Non
         return
     while n < stop:
         i = min(BEAM_LENGTH, stop - n)
-        after = descend_by_beam(world, way, k, world.field[k, 0], n, n + i, np.inf, i, i, need)
+        after = descend_by_beam(world, way, k, world.field[k, 0], n, n + i, np.inf, (i, i), need)
         if after < 0:
             stay(world, way, n, stop)
             return

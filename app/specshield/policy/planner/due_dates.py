@@ -16,7 +16,7 @@ import numpy as np
 from specshield.arrays import Floats, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.literals import LAST, PREDICATE, SIDE, PackedLiterals
-from specshield.policy.progress.values import fill_place
+from specshield.policy.progress import fill_place
 from specshield.stl.program import evaluate_packed
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, tree_bounds
 

@@ -18,7 +18,7 @@ from specshield.policy.planner.due_dates import NO_DATE, read_pose
 from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
 from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
-from specshield.policy.tree import Tree, is_new, make_tree, pop, push, put, trace
+from specshield.policy.tree import DEGREE, Grain, Tree, enter, make_tree, pop, push, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
@@ -103,10 +103,12 @@ def _reach(
             if n + made + ahead > stop + ASTRAY:
                 continue
             put(tree, count, x, y, theta, made, here, m)
-            if not is_new(tree, count, FINE if ahead < NEAR else grain, True):
+            slot = enter(tree, count, Grain(1.0, FINE if ahead < NEAR else grain, DEGREE), True)
+            if slot < 0:
                 continue
             read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
             if not keeps(world, k, way.t + n + made, need, way.rho):
+                tree.table[slot] = -1  # its row is used again
                 continue
             if holds(world, k, way.rho):
                 trace(tree, count, way.motions[n:])

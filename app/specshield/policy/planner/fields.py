@@ -5,6 +5,7 @@ They are computed on the lattice, by the sweeps of reachability.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,14 +19,12 @@ from specshield.policy.lattice import (
     Lattice,
     beside,
     coordinates,
-    coordinates_ahead,
     corner,
-    heading_after,
     leads_back,
     values_at,
 )
 from specshield.policy.planner.literals import Literal
-from specshield.policy.progress.values import initial_signals
+from specshield.policy.progress import initial_signals
 from specshield.policy.reachability.latest import sweep
 from specshield.policy.reachability.sight import BESIDE, about
 from specshield.robot.dynamics import Body, displacement, make_body
@@ -112,10 +111,13 @@ def to_go_after(
 ) -> None:
     """Steps to go after each motion (M,), contact left out; inf for what leads straight back after `last`."""
     headings = fields.code.shape[2]
-    v, u, h, dv, du = coordinates_ahead(body, fields.pitch, headings, x, y, theta)
+    v, u, h = coordinates(body, fields.pitch, headings, x, y, theta)
+    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
+    dv, du = math.sin(grid_theta) / fields.pitch, math.cos(grid_theta) / fields.pitch  # cells a metre ahead
     for m in range(out.shape[0]):
         d, angle = displacement(body, m)
         if leads_back(body, last, m) or (d == 0.0 and angle == 0.0):
             out[m] = np.inf
             continue
-        out[m] = to_go(fields, f, v + d * dv, u + d * du, heading_after(headings, h, angle))
+        w = h + angle * headings / (2.0 * math.pi)
+        out[m] = to_go(fields, f, v + d * dv, u + d * du, w if w >= 0.0 else w + headings)

@@ -12,7 +12,7 @@ from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, r
 from specshield.policy.planner.exact import search_exactly
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
-from specshield.policy.progress.values import fill_signals
+from specshield.policy.progress import fill_signals
 from specshield.policy.undo import IMPOSSIBLE, undo_motion
 from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS
@@ -75,24 +75,17 @@ def _rejoin(world: World, way: Way, base: Ints) -> bool:
 
 @kernel
 def plan_all(
-    world: World,
-    t: int,
-    pose: Floats,
-    signals: Floats,
-    prefix: Floats,
-    effort: float,
-    most: int,
-    motions: Ints,
+    world: World, t: int, pose: Floats, held: Floats, prefix: Floats, effort: float, most: int, motions: Ints
 ) -> tuple[int, bool]:
     """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
     takes, and whether there is a plan.
 
-    signals (S,): the values that they keep; prefix (size,): the formula's leaves to step t; most: how many
+    held (S,): the values that signals keep; prefix (size,): the formula's leaves to step t; most: how many
     poses a search over exact poses may make. First a plan from x_t is looked for. Each other first motion is
     undone to go the same way. If that comes too late, a plan after that motion is looked for.
     """
     count, steps = motions.shape
-    way = make_way(world, t, steps, signals)
+    way = make_way(world, t, steps, held)
     nodes = make_nodes(world.literals.literal.shape[0], count)
     base, left, order = -1, np.inf, np.arange(count)
     if count > USUAL_MOTIONS:  # neighbours in the robot's list often fail alike, so others come in between

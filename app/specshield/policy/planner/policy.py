@@ -29,7 +29,7 @@ from specshield.errors import MapError, PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import INVALID, STEP_CODES, make_lattice, number_cells
+from specshield.policy.lattice import INVALID, STEP_CODES, headings_of, make_lattice, number_cells, side_of
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import cost_of, foresee, is_open_if, make_bounds
@@ -38,9 +38,8 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
-from specshield.policy.progress.recall import residuals
+from specshield.policy.progress import residuals
 from specshield.policy.reachability.stored import check_fit
-from specshield.policy.shape import headings_of, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.policy.undo import turning_motion
 from specshield.reasons.still_open import bounds_after, still_open

@@ -201,7 +201,7 @@ def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
                 waits = (column == 0 or keep >= 0) and world.stands
                 arrived = descend(world, way, k, f, waits, n, stop, need)
                 if arrived < 0:  # it came too late or got stuck: a beam looks at more than one way
-                    arrived = descend_by_beam(world, way, k, f, n, stop, 0.0, 0, BEAM_LENGTH, need)
+                    arrived = descend_by_beam(world, way, k, f, n, stop, 0.0, (0, BEAM_LENGTH), need)
         if keep >= 0:
             need[keep, BEGIN], need[keep, UNTIL] = begin, until
         if arrived < 0:

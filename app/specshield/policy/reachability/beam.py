@@ -31,6 +31,18 @@ EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables c
 POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that are equal after multiplying by this and rounding count once
 
 
+class Terms(NamedTuple):
+    """What one beam is allowed. share: the poses kept for each root. band: a pose with less slack [steps] is
+    given up. target: a way may end where the latest feasible time [steps] is above it. every: from each pose
+    one motion in so many is tried, from other poses other ones.
+    """
+
+    share: int
+    band: float
+    target: float
+    every: int
+
+
 class Poses(NamedTuple):
     """Poses at one step [N], with the progress, the slack [steps] and the roots they come from, as bits."""
 
@@ -57,12 +69,14 @@ class Edges(NamedTuple):
 class Beam(NamedTuple):
     """What one beam works on.
 
-    here: the poses kept at a step; new: those that their motions lead to. begun [R, K]: the roots' status at
-    the beginning. table: where the poses of `new` are looked up; place [N]: the row that each has in `here`;
-    kept [R]: how many poses each root has there; heap: of the rows of `new`, the most slack first. every:
-    as in `beam_search`.
+    here: the poses kept at a step, at most `width`; new: those that their motions lead to. begun [R, K]: the
+    roots' status at the beginning. table: where the poses of `new` are looked up; place [N]: the row that
+    each has in `here`; kept [R]: how many poses each root has there; heap: of the rows of `new`, the most
+    slack first. motions (R, n), taken (R,): as `beam_search` returns them.
     """
 
+    terms: Terms
+    width: int
     here: Poses
     new: Poses
     edges: Edges
@@ -71,35 +85,23 @@ class Beam(NamedTuple):
     place: Ints
     kept: Ints
     heap: Heap
-    every: int
+    motions: Ints
+    taken: Ints
 
 
 @kernel
 def beam_search(
-    guide: Guide,
-    t: int,
-    pose: Floats,
-    status: Int8s,
-    run: Ints,
-    share: int,
-    band: float,
-    target: float,
-    every: int,
-    scratch: Scratch,
-    motions: Ints,
-    taken: Ints,
-) -> None:
+    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, steps: int, terms: Terms, scratch: Scratch
+) -> tuple[Ints, Ints]:
     """Keeps the poses of most slack at every step, until each root has a way or no pose is left.
 
-    pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
-    band: a pose with less slack [steps] is given up. A way ends where every goal is settled, where one more
-    goal is settled and EASY steps are to spare, or where the latest feasible time [steps] is above `target`.
-    every: from each pose one motion in so many is tried, from other poses other ones.
-    Writes each root's way into motions (R, n) and its length into taken (R,), 0 where none was found.
+    pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. steps: of the longest way. A way
+    ends where every goal is settled, where one more goal is settled and EASY steps are to spare, or where the
+    latest feasible time is above the target. Returns each root's way, motions (R, steps), and its length,
+    taken (R,), 0 where none was found.
     """
     roots, k_count = status.shape
-    steps = motions.shape[1]
-    width = max(min(share * roots, MAX_KEPT), share)
+    width = max(min(terms.share * roots, MAX_KEPT), terms.share)
     room = width * motion_count(guide.body)
     edges = Edges(
         child=np.empty((steps, room), np.int32),
@@ -109,6 +111,8 @@ def beam_search(
         tag=np.zeros((steps, width), np.int64),
     )
     beam = Beam(
+        terms=terms,
+        width=width,
         here=_poses(width, k_count),
         new=_poses(room, k_count),
         edges=edges,
@@ -117,21 +121,20 @@ def beam_search(
         place=np.empty(room, np.int64),
         kept=np.empty(roots, np.int64),
         heap=Heap(np.empty(room, np.int32), np.empty(room)),
-        every=every,
+        motions=np.empty((roots, steps), np.int64),
+        taken=np.zeros(roots, np.int64),
     )
     for r in range(roots):
         _put(beam.here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
         beam.here.tag[r] = 1 << r
-    taken[:] = 0
     open_roots, count = (1 << roots) - 1, roots
     for n in range(steps):
-        found = _expand(guide, t, n, count, open_roots, band, beam, scratch)
-        open_roots = _finish(t, n, found, open_roots, target, beam, motions, taken)
-        if open_roots == 0:
-            return
-        count = _select(found, n, open_roots, width, share, band, beam)
-        if count == 0:
-            return
+        found = _expand(guide, t, n, count, open_roots, beam, scratch)
+        open_roots = _finish(t, n, found, open_roots, beam)
+        count = _select(found, n, open_roots, beam)
+        if open_roots == 0 or count == 0:
+            break
+    return beam.motions, beam.taken
 
 
 @kernel
@@ -147,12 +150,10 @@ def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Int8s, run
 
 
 @leaf
-def _expand(
-    guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, beam: Beam, scratch: Scratch
-) -> int:
+def _expand(guide: Guide, t: int, n: int, count: int, open_roots: int, beam: Beam, scratch: Scratch) -> int:
     """Makes motions from the first `count` poses of `here`. Writes each new pose once; returns how many."""
     body, rules, tables, _, _ = guide
-    here, new, edges = beam.here, beam.new, beam.edges
+    here, new, edges, band, every = beam.here, beam.new, beam.edges, beam.terms.band, beam.terms.every
     found, joined, turns_matter = 0, 0, reads_heading(rules.programs, rules.regions)
     beam.table[:] = -1
     for w in range(count):
@@ -161,9 +162,9 @@ def _expand(
             continue
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-        some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # scattered by Knuth's hash
+        some = ((31 * w + n) * 2654435761 >> 16) % every, every  # scattered by Knuth's hash
         cos, sin, room = around(body, before_x, before_y, before)
-        corners = score(guide, before_x, before_y, before, cos, sin, t + n, -1, some, scratch)
+        corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(some[0], motion_count(body), some[1]):
@@ -225,11 +226,9 @@ def _lowest(scores: Floats) -> float:
 
 
 @leaf
-def _finish(
-    t: int, n: int, found: int, open_roots: int, target: float, beam: Beam, motions: Ints, taken: Ints
-) -> int:
+def _finish(t: int, n: int, found: int, open_roots: int, beam: Beam) -> int:
     """Writes the way of every root that has one now; returns the roots that are still open, as bits."""
-    new, begun = beam.new, beam.begun
+    new, begun, target = beam.new, beam.begun, beam.terms.target
     for c in range(found):
         arrived = new.tag[c] & open_roots
         ahead = new.slack[c]
@@ -242,30 +241,31 @@ def _finish(
             for k in range(begun.shape[1]):
                 gained = gained or new.status[c, k] != begun[r, k]
             if gained:
-                _trace(n, c, r, beam.edges, motions[r])
-                taken[r] = n + 1
+                _trace(n, c, r, beam.edges, beam.motions[r])
+                beam.taken[r] = n + 1
                 open_roots &= ~(1 << r)
     return open_roots
 
 
 @leaf
-def _select(found: int, n: int, open_roots: int, width: int, share: int, band: float, beam: Beam) -> int:
+def _select(found: int, n: int, open_roots: int, beam: Beam) -> int:
     """Puts the poses to go on with into `here`, most slack first, until each root has its share; returns how
     many there are. found: how many poses `new` has. Removes the edges to poses that are not kept.
     """
-    here, new, edges, place, kept, heap = beam.here, beam.new, beam.edges, beam.place, beam.kept, beam.heap
+    terms, here, new, edges, place, kept = beam.terms, beam.here, beam.new, beam.edges, beam.place, beam.kept
+    heap = beam.heap
     for r in range(kept.shape[0]):
         kept[r] = 0
     size = 0
     for o in range(found):
         place[o] = -1
-        if new.slack[o] >= band and new.tag[o] & open_roots != 0:
+        if new.slack[o] >= terms.band and new.tag[o] & open_roots != 0:
             heap.row[size], heap.rank[size] = o, -new.slack[o]
             size += 1
     for i in range(size // 2 - 1, -1, -1):
         sink(heap, i, size, heap.row[i], heap.rank[i])
     count, full = 0, 0  # full: the roots that have their share
-    while size > 0 and count < width:
+    while size > 0 and count < beam.width:
         o = heap.row[0]
         size -= 1
         sink(heap, 0, size, heap.row[size], heap.rank[size])
@@ -274,7 +274,7 @@ def _select(found: int, n: int, open_roots: int, width: int, share: int, band: f
             continue
         for r in range(kept.shape[0]):
             kept[r] += tag >> r & 1
-            if kept[r] >= share:
+            if kept[r] >= terms.share:
                 full |= 1 << r
         _put(here, count, new.pose[o, 0], new.pose[o, 1], new.pose[o, 2], new.status[o], new.run[o])
         here.tag[count], place[o] = tag, count

@@ -12,11 +12,12 @@ from specshield.policy.progress import (
     EVENTUALLY,
     EVENTUALLY_ALWAYS,
     PENDING,
+    Past,
     Rules,
     advance,
+    recall,
     value_count,
 )
-from specshield.policy.progress.recall import Past, recall
 from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_settled, slack
 from specshield.rule.values import REGIONS, fill_pose, fill_region
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed

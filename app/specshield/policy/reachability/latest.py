@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints, Singles
-from specshield.compiled import Boxed, box, kernel
+from specshield.compiled import Boxed, box, kernel, leaf
 from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, goals_of
-from specshield.policy.reachability.beam import MAX_SCORED, beam_search
+from specshield.policy.reachability.beam import MAX_SCORED, Terms, beam_search
 from specshield.policy.reachability.guide import copy_progress, make_scratch
 from specshield.policy.reachability.tables import LATE, Guide, Tables, guided, slack
 from specshield.robot.dynamics import motion_count
@@ -98,18 +98,29 @@ def latest_times(
             for after in masks:
                 if after & mask == mask and after != mask:
                     added = np.array([g for n, g in enumerate(goals) if (after ^ mask) >> n & 1])
-                    _settle(rules, holds, added, tables[i, index[after]], float(phase.start), table)
+                    _settle(rules, holds, added, tables[i, index[after]], phase.start, table)
                     if np.any(rules.kind[added] == EVENTUALLY_ALWAYS):
                         through = np.ones_like(lattice.valid)
                         for j in range(i + 1, len(phases)):  # a dwell that goes on in a later phase
                             through &= valid[j]
                             later = np.where(through, tables[j, index[after]], np.float32(NO_TIME))
-                            _settle(rules, holds, added, later, float(phases[j].start), table)
+                            _settle(rules, holds, added, later, phases[j].start, table)
             table[table > phase.end] = phase.end
             table[(table < phase.start) | (valid[i] == 0)] = NO_TIME
             if i + 1 < len(phases) or mask != masks[0]:  # elsewhere nothing is left to do
                 sweep(lattice, valid[i], float(phase.start), table)
     return tables, valid
+
+
+@leaf
+def _moved(lattice: Lattice, valid: Bytes, table: Singles, j: int, i: int, h: int) -> float:
+    """The latest time in a table [ny, nx, H] where the moves from a pose lead, NO_TIME if there is none."""
+    best = NO_TIME
+    for d in range(lattice.far_u.shape[3]):
+        u, v = lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d]
+        if u != np.float32(-1.0):
+            best = max(best, bilinear(valid, table, v, u, lattice.far_h[j, i, h, d]))
+    return best
 
 
 @kernel
@@ -122,11 +133,7 @@ def _enter(lattice: Lattice, valid: Bytes, following: Singles, start: int, table
         for i in range(nx):
             for h in range(headings):
                 best = following[j, i, h] if valid[j, i, h] else np.float32(NO_TIME)
-                for d in range(lattice.far_u.shape[3]):
-                    u = lattice.far_u[j, i, h, d]
-                    if u != np.float32(-1.0):
-                        v, w = lattice.far_v[j, i, h, d], lattice.far_h[j, i, h, d]
-                        best = max(best, np.float32(bilinear(valid, following, v, u, w)))
+                best = max(best, np.float32(_moved(lattice, valid, following, j, i, h)))
                 for r in range(lattice.shift.shape[0]):
                     w = (h + lattice.shift[r]) % headings
                     if lattice.turns[j, i, h, r] and valid[j, i, w]:
@@ -135,32 +142,19 @@ def _enter(lattice: Lattice, valid: Bytes, following: Singles, start: int, table
                     table[j, i, h] = start - 1
 
 
-@kernel
-def _settle(rules: Rules, holds: Bytes, added: Ints, ahead: Singles, start: float, table: Singles) -> None:
+def _settle(rules: Rules, holds: Bytes, added: Ints, ahead: Singles, start: int, table: Singles) -> None:
     """Writes m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
-    for j in range(table.shape[0]):
-        for i in range(table.shape[1]):
-            for h in range(table.shape[2]):
-                left = ahead[j, i, h]
-                latest = left
-                for k in added:
-                    if not holds[k, j, i, h]:
-                        latest = np.float32(NO_TIME)
-                        break
-                    if rules.kind[k] == EVENTUALLY_ALWAYS:
-                        dwell = rules.b[k] - rules.c2[k] + 1
-                        if left < max(start, rules.a[k] + rules.b[k]):
-                            latest = np.float32(NO_TIME)
-                            break
-                        latest = min(
-                            latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1)
-                        )
-                    else:
-                        if left < max(start, rules.a[k]) or start > rules.b[k]:
-                            latest = np.float32(NO_TIME)
-                            break
-                        latest = min(latest, np.float32(rules.b[k]))
-                table[j, i, h] = max(table[j, i, h], latest)
+    latest, possible = ahead, np.ones(ahead.shape, np.bool_)
+    for k in added:
+        if rules.kind[k] == EVENTUALLY_ALWAYS:
+            over, by = rules.a[k] + rules.b[k], np.float32(rules.c1[k] + rules.c2[k])
+            latest = np.minimum(latest, np.minimum(by, ahead - np.float32(rules.b[k] - rules.c2[k])))
+        else:
+            over, by = rules.a[k], np.float32(rules.b[k])
+            latest = np.minimum(latest, by)
+            possible &= start <= rules.b[k]
+        possible &= (holds[k] == 1) & (ahead >= max(start, over))
+    np.maximum(table, np.where(possible, latest, np.float32(NO_TIME)), out=table)
 
 
 @kernel
@@ -191,17 +185,7 @@ def sweep(lattice: Lattice, valid: Bytes, start: float, table: Singles) -> None:
                 for h in range(headings):
                     if not valid[j, i, h]:
                         continue
-                    best = table[j, i, h]
-                    for d in range(lattice.far_u.shape[3]):
-                        u = lattice.far_u[j, i, h, d]
-                        if u != np.float32(-1.0):
-                            found = (
-                                bilinear(
-                                    valid, table, lattice.far_v[j, i, h, d], u, lattice.far_h[j, i, h, d]
-                                )
-                                - 1.0
-                            )
-                            best = max(best, np.float32(found))
+                    best = np.float32(_moved(lattice, valid, table, j, i, h) - 1.0)
                     if best > table[j, i, h] + SETTLED_CHANGE and best >= start:
                         table[j, i, h] = best
                         gained = True
@@ -282,7 +266,8 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
     tables, horizon, motions = guide.tables, guide.tables.end[-1], motion_count(guide.body)
     scratch, every = make_scratch(guide.rules, motions), 1 + (motions - 1) // MAX_SCORED
     tried, found = 0, 0
-    here, run, taken = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64), np.empty(1, np.int64)
+    here, run = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64)
+    terms = Terms(width, late - 1.0, np.inf, every)
     for n in range(poses.shape[0]):
         here[0] = poses[n]
         copy_progress(status[n], run[0], scratch.status, scratch.run)
@@ -291,9 +276,8 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
             ahead = slack(guide, here[0, 0], here[0, 1], here[0, 2], start, scratch)
             t = start + int(np.floor(ahead - late)) + 1
             if start <= t <= end and t < horizon:
-                way = np.empty((1, horizon - t), np.int64)
                 own = status[n : n + 1]
-                beam_search(guide, t, here, own, run, width, late - 1.0, np.inf, every, scratch, way, taken)
+                _, taken = beam_search(guide, t, here, own, run, horizon - t, terms, scratch)
                 tried, found = tried + 1, found + (taken[0] > 0)
                 break
             start = end + 1

@@ -21,25 +21,23 @@ from specshield.compiled import Boxed, box
 from specshield.errors import MapError, PolicyError, SampleError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
+from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter, pose_count
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.progress import Rules, make_rules
+from specshield.policy.progress import Rules, make_rules, pasts
 from specshield.policy.progress.obligations import obligations
-from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack
 from specshield.policy.reachability.latest import lateness, latest_times, masks_of, pack_times, phases_of
 from specshield.policy.reachability.method import Settings
-from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
+from specshield.policy.reachability.narrow import AFTER, FIRST, ON, Narrow, continue_narrow
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import LATE, Guide, Tables
-from specshield.policy.shape import headings_of, side_of
 from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.rule.values import signal_rows
 from specshield.rule.view import view_of
@@ -167,9 +165,9 @@ class ReachabilityPolicy(Carded):
         return self._proposal(history, signals, margin, FIRST if len(history) == 1 else ON)
 
     def _proposal(
-        self, history: Floats, signals: Mapping[str, Floats], margin: float, effort: Floats
+        self, history: Floats, signals: Mapping[str, Floats], margin: float, effort: tuple[int, int]
     ) -> Proposal:
-        """effort: of the search for narrow predicates."""
+        """effort: of the search for narrow predicates (narrow.py)."""
         rules = Rules(*self._rules[:-2], self._rules.signals.copy(), margin)
         read = moved(self.task)[0].names  # what the rule asks of other signals, no motion changes
         rows = signal_rows(self.task, {name: signals[name] for name in read if name in signals}, len(history))
@@ -195,8 +193,8 @@ class ReachabilityPolicy(Carded):
                 proposals.append(Proposal(ways, still))
                 continue
             if waits and True in self.narrow.tolist():
-                of_narrow = self.narrow, self._top, effort
-                preferred = continue_narrow(guide, margin, *of_narrow, past, wanted, least, motions, poses)
+                about = Narrow(self.narrow, self._top), effort
+                preferred = continue_narrow(guide, margin, *about, past, wanted, least, motions, poses)
             else:
                 beam = self.settings.beam
                 preferred = continue_all(guide, margin, beam, past, wanted, least, motions, poses)
@@ -315,8 +313,7 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
         entries, most = (task.horizon + 1) * -(-state_count(rules) // 8), MAX_BYTES
     else:
         entries, most = len(masks_of(rules)) * len(phases_of(rules, task.horizon)), MAX_ENTRIES
-    ny, nx = side_of(task.grid, settings.pitch / 3.0)
-    if ny * nx * headings_of(task) * entries <= FINE_ENTRIES:
+    if pose_count(task, settings.pitch / 3.0) * entries <= FINE_ENTRIES:
         return settings.pitch / 3.0, None
     pitch = fitting_pitch(task, settings.pitch, entries, most)
     if pitch == settings.pitch:

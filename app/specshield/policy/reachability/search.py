@@ -16,12 +16,28 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import Boxed, kernel, leaf
-from specshield.policy.detour import copy_ways, find_sibling, find_twins
-from specshield.policy.progress.recall import Past, Present, resume
-from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, beam_search
-from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
-from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, guided, slack
-from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
+from specshield.policy.detour import copy_ways, find_sibling, find_twins, join
+from specshield.policy.progress import Past, Present, advance, resume
+from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, Terms, beam_search
+from specshield.policy.reachability.guide import (
+    copy_progress,
+    fill,
+    is_over,
+    make_scratch,
+    read_due,
+    update_progress,
+)
+from specshield.policy.reachability.tables import (
+    HOPELESS,
+    SAFE,
+    Guide,
+    Scratch,
+    goals_settled,
+    guided,
+    is_broken,
+    slack,
+)
+from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.dynamics import displacement, motion_count, simulate, step
 
@@ -59,10 +75,11 @@ class Starts(NamedTuple):
     order: Ints
     wanted: Bools
     sibling: Ints
+    scratch: Scratch
 
 
 @kernel
-def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats) -> tuple[Starts, Scratch]:
+def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats) -> Starts:
     """Makes every motion once from x_t. A motion whose twin is wanted becomes wanted; if none is, so does the
     motion of most slack. The arguments are those of `continue_all`.
     """
@@ -97,10 +114,9 @@ def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats)
     for m in range(count):
         wanted[twin[m]] |= wanted[m]
     sibling = np.empty(3, np.int64)
-    starts = Starts(
-        now, motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling
+    return Starts(
+        now, motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling, scratch
     )
-    return starts, scratch
 
 
 @kernel
@@ -122,8 +138,8 @@ def continue_all(
     written of motions that are not wanted need not be a way.
     """
     guide = guided(boxed, margin)
-    starts, scratch = begin(guide, past, wanted, motions, poses)
-    t, order, twin, settled = starts.now.t, starts.order, starts.twin, starts.settled
+    starts = begin(guide, past, wanted, motions, poses)
+    t, scratch, order, twin, settled = starts.now.t, starts.scratch, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):
         return -1
     walked = np.empty(order.shape[0], np.int64)
@@ -137,9 +153,9 @@ def continue_all(
             settled[m] = starts.slack[m] == SAFE
             continue
         ahead = starts.slack[m]
-        settled[m] = join_sibling(guide, t, walked[:ways], int(m), starts, scratch)
+        settled[m] = join_sibling(guide, walked[:ways], int(m), starts)
         if base >= 0 and not settled[m]:
-            settled[m] = go_back(guide, t, int(m), motions[base], poses[base], starts, scratch)
+            settled[m] = go_back(guide, int(m), motions[base], poses[base], starts)
         if not settled[m] and (ahead >= 0.0 or base < 0 or starts.turn[m] == IMPOSSIBLE):
             copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
             escapes = ahead >= (0.0 if base < 0 else EASY)
@@ -152,44 +168,78 @@ def continue_all(
     every = 1 + (order.shape[0] - 1) // (MAX_SCORED if waits else MAX_TRIED)
     while True:
         late = guide.tables.late
-        _beam_out(guide, t, min(NARROW_SHARE, width), width, max(0.5 * late, lowest), every, starts, scratch)
-        _beam_out(guide, t, width, width, max(late, lowest), every, starts, scratch)
+        _beam_out(guide, min(NARROW_SHARE, width), width, max(0.5 * late, lowest), every, starts)
+        _beam_out(guide, width, width, max(late, lowest), every, starts)
         if every == 1 or np.any(settled):
             break
         every = 1
     if guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL:
-        _beam_out(guide, t, SMALL_SHARE, width, max(2.0 * HOPELESS, lowest), 1, starts, scratch)
+        _beam_out(guide, SMALL_SHARE, width, max(2.0 * HOPELESS, lowest), 1, starts)
     copy_ways(motions, poses, twin)
     best = order[0]
     return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
 
 
 @leaf
-def join_sibling(guide: Guide, t: int, known: Ints, m: int, starts: Starts, scratch: Scratch) -> bool:
+def join_sibling(guide: Guide, known: Ints, m: int, starts: Starts) -> bool:
     """Lets motion m join the way of one of the motions `known` that led to the same place. Returns whether
     every goal was settled.
     """
     motions, poses, found = starts.motions, starts.poses, starts.sibling
     find_sibling(guide.body, poses, known, m, True, found)
-    if found[0] < 0:
-        return False
-    copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
-    other = found[0]
-    return rejoin(
-        guide, t, found[1], -1, motions[other], poses[other], found[2], motions[m], poses[m], scratch
-    )
+    other, turn, at = found[0], found[1], found[2]
+    return other >= 0 and _rejoin(guide, turn, -1, motions[other], poses[other], at, m, starts)
 
 
 @leaf
-def go_back(guide: Guide, t: int, m: int, base: Ints, led: Floats, starts: Starts, scratch: Scratch) -> bool:
+def go_back(guide: Guide, m: int, base: Ints, led: Floats, starts: Starts) -> bool:
     """Undoes motion m to go by `base` (T - t,), a way from x_t that leads to the poses `led` (T - t, 3).
     Returns whether every goal was settled; if no motion undoes it, nothing is written.
     """
     turn, move = starts.turn[m], starts.move[m]
-    if turn == IMPOSSIBLE:
-        return False
+    return turn != IMPOSSIBLE and _rejoin(guide, turn, move, base, led, 0, m, starts)
+
+
+@leaf
+def _rejoin(
+    guide: Guide, turn: int, move: int, base: Ints, led: Floats, at: int, m: int, starts: Starts
+) -> bool:
+    """Goes on after motion m by `turn` and `move`, then by `base`, a way to every goal: see `join`.
+
+    led (T - t, 3): the poses of `base`, which are taken over from where the robot is at the very same pose.
+    The robot may be only nearly on that way, so the result says whether every goal was settled.
+    """
+    body, rules, tables, wait, _ = guide
+    t, motions, poses, scratch = starts.now.t, starts.motions[m], starts.poses[m], starts.scratch
     copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
-    return rejoin(guide, t, turn, move, base, led, 0, starts.motions[m], starts.poses[m], scratch)
+    join(turn, move, base, at, wait, motions)
+    x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
+    n, looked, joined = 1, False, 1 + (turn >= 0) + (move >= 0)
+    while n < motions.shape[0] and not is_over(rules, tables, t + n, scratch.status):
+        if is_broken(scratch.status):
+            break
+        if motions[n] != wait:
+            known = False
+            if n >= joined:  # `base` has the same motions in the same order, waits apart
+                while base[at] == wait:
+                    at += 1
+                known = at > 0 and led[at - 1, 0] == x and led[at - 1, 1] == y and led[at - 1, 2] == theta
+                at += 1
+            if known:
+                x, y, theta = led[at - 1, 0], led[at - 1, 1], led[at - 1, 2]
+            else:
+                x, y, theta = step(body, x, y, theta, motions[n])
+            update_progress(rules, t + n + 1, x, y, theta, scratch)
+            looked = False
+        else:
+            if not looked:
+                read_due(rules, t + motions.shape[0], x, y, theta, scratch)
+            looked = True
+            advance(rules, t + n + 1, scratch.predicates, scratch.status, scratch.run)
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+        n += 1
+    fill(n, wait, motions, poses)
+    return goals_settled(rules, scratch.status)
 
 
 @kernel
@@ -203,29 +253,17 @@ def _follow(
     for _ in range(MAX_ESCAPES if escapes else 0):
         if outcome != STUCK:
             break
-        status, run = scratch.high_status.copy(), scratch.high_run.copy()
+        status, run = scratch.high_status.copy().reshape(1, -1), scratch.high_run.copy().reshape(1, -1)
         x, y, theta = poses[n - 1]
-        copy_progress(status, run, scratch.status, scratch.run)
+        copy_progress(status[0], run[0], scratch.status, scratch.run)
         high = t + n + slack(guide, x, y, theta, t + n, scratch)
-        way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
-        taken = np.empty(1, np.int64)
-        beam_search(
-            guide,
-            t + n,
-            poses[n - 1 : n],
-            status.reshape(1, -1),
-            run.reshape(1, -1),
-            width,
-            high - (t + n) - ESCAPE_LOSS,
-            high + ESCAPE_GAIN,
-            1 + (motion_count(guide.body) - 1) // MAX_SCORED,
-            scratch,
-            way,
-            taken,
-        )
+        every = 1 + (motion_count(guide.body) - 1) // MAX_SCORED
+        terms = Terms(width, high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, every)
+        steps = min(motions.shape[0] - n, ESCAPE_LENGTH)
+        way, taken = beam_search(guide, t + n, poses[n - 1 : n], status, run, steps, terms, scratch)
         if taken[0] == 0:
             break
-        copy_progress(status, run, scratch.status, scratch.run)
+        copy_progress(status[0], run[0], scratch.status, scratch.run)
         n = take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
         outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     if outcome == STUCK:
@@ -247,13 +285,11 @@ def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, 
 
 
 @kernel
-def _beam_out(
-    guide: Guide, t: int, share: int, width: int, band: float, every: int, starts: Starts, scratch: Scratch
-) -> None:
+def _beam_out(guide: Guide, share: int, width: int, band: float, every: int, starts: Starts) -> None:
     """Looks for a way after every first motion that is wanted, has no way yet, and has a slack of at least
-    `band` [steps]. share, every: see `beam_search`; width: see `continue_all`.
+    `band` [steps]. share, every: see `Terms`; width: see `continue_all`.
     """
-    motions, poses = starts.motions, starts.poses
+    t, motions, poses, scratch = starts.now.t, starts.motions, starts.poses, starts.scratch
     steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
     roots = np.array([m for m in starts.order if starts.twin[m] == m and sought[m]], dtype=np.int64)
     if steps == 0:
@@ -261,9 +297,9 @@ def _beam_out(
     most = ROOTS if guide.wait >= 0 else MAX_ROOTS
     while roots.shape[0] > 0:
         some, rest = roots[:most], roots[most:]
-        way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         here, status, run = poses[some, 0], starts.status[some], starts.run[some]
-        beam_search(guide, t + 1, here, status, run, share, band, np.inf, every, scratch, way, taken)
+        terms = Terms(share, band, np.inf, every)
+        way, taken = beam_search(guide, t + 1, here, status, run, steps, terms, scratch)
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:
@@ -279,5 +315,5 @@ def _beam_out(
             if known.shape[0] == 0:  # others will hardly have a way either, so more of them share a beam
                 most = min(2 * most, MAX_ROOTS)
             for m in rest:
-                starts.settled[m] = join_sibling(guide, t, known, m, starts, scratch)
+                starts.settled[m] = join_sibling(guide, known, m, starts)
         roots = rest[~starts.settled[rest]]

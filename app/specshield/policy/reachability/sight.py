@@ -4,7 +4,7 @@ its headings.
 Tables are made on crossings. A dock smaller than a cell, or a heading that no crossing has, holds at none of
 them, and the tables would say that nothing leads there. So such a predicate counts as kept wherever it holds
 within about half a cell and half a heading: the tables lead near, and the rest of the way is searched for in
-exact poses (finish.py).
+exact poses (narrow.py).
 """
 
 from __future__ import annotations
@@ -60,10 +60,8 @@ def _views(body: Body, rules: Rules, lattice: Lattice, k: int) -> tuple[Bools, B
     samples = 2 * math.ceil(0.5 * unit / GRAIN) + 1 if heading else 1
     spread = np.linspace(-0.5, 0.5, samples) if heading else np.zeros(1)
     free = np.any(lattice.valid, axis=2) if place else np.ones((1, 1), np.bool_)
-    shape = (*free.shape, headings if heading or turned else 1)
-    outer, inner = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    look(body, rules, k, lattice.pitch, headings, free, spread, BESIDE * lattice.pitch, outer, inner)
-    return outer, inner
+    looked = headings if heading or turned else 1
+    return look(body, rules, k, lattice.pitch, looked, free, spread, BESIDE * lattice.pitch)
 
 
 def reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
@@ -77,23 +75,14 @@ def reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
 
 @kernel
 def look(
-    body: Body,
-    rules: Rules,
-    k: int,
-    pitch: float,
-    headings: int,
-    free: Bools,
-    spread: Floats,
-    beside: float,
-    outer: Bools,
-    inner: Bools,
-) -> None:
-    """Writes, for each pose of a lattice over the cells `free` [ny, nx], whether predicate k holds somewhere
-    within `beside` [m] of it, and whether it holds by as much all about it, [ny, nx, H].
+    body: Body, rules: Rules, k: int, pitch: float, headings: int, free: Bools, spread: Floats, beside: float
+) -> tuple[Bools, Bools]:
+    """For each pose of a lattice over the cells `free` [ny, nx], whether predicate k holds somewhere within
+    `beside` [m] of it, and whether it holds by as much all about it, [ny, nx, headings].
 
-    headings: of the whole lattice; spread: those that are looked at about each, as shares of the way to the
-    next.
+    spread: the headings that are looked at about each, as shares of the way to the next.
     """
+    outer, inner = np.zeros((*free.shape, headings), np.bool_), np.zeros((*free.shape, headings), np.bool_)
     values, stack, out = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(rules.kind.shape[0])
     for j in range(outer.shape[0]):
         for i in range(outer.shape[1]):
@@ -107,6 +96,7 @@ def look(
                     least, most = min(least, out[k]), max(most, out[k])
                 outer[j, i, h] = most > rules.margin - beside
                 inner[j, i, h] = least > rules.margin + beside
+    return outer, inner
 
 
 def about(inner: Bools) -> Bools:

@@ -21,9 +21,9 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Lattice, corner
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.sight import cells_about
-from specshield.policy.reachability.tables import Tables
+from specshield.policy.reachability.tables import Tables, is_broken, number_of
 
 MAX_BYTES = 100_000_000  # of the tables
 BROKEN_STATE = -1
@@ -47,32 +47,23 @@ def state_count(rules: Rules) -> int:
     return math.prod(1 if kind == ALWAYS else int(n) + 2 for kind, n in zip(rules.kind, dwell, strict=True))
 
 
-def transitions(rules: Rules, t: int, holds: int) -> Ints:
-    """The progress after step t for each before it, BROKEN_STATE where that breaks the formula.
+@kernel
+def transitions(rules: Rules, stride: Ints, dwell: Ints, states: int, t: int, holds: int) -> Ints:
+    """The progress after step t for each before it (states,), BROKEN_STATE where that breaks the formula.
 
-    holds: bit k says whether obligation k's predicate does.
+    stride, dwell: of `digits_of`; holds: bit k says whether obligation k's predicate does.
     """
-    stride, dwell = digits_of(rules)
-    before = np.arange(state_count(rules))
-    after = np.zeros_like(before)
-    broken = np.zeros(len(before), bool)
-    for k in np.flatnonzero(rules.kind != ALWAYS):
-        true, full = bool(holds >> int(k) & 1), int(dwell[k])
-        digit = before // stride[k] % (full + 2)
-        settled = digit == full + 1
-        if rules.kind[k] == EVENTUALLY_ALWAYS:
-            counts = true and t >= rules.a[k] + rules.c2[k]
-            run = np.minimum(digit + 1, full) if counts else np.zeros_like(digit)
-            done = (run >= full) & (t >= rules.a[k] + rules.b[k])
-            late = ~done & (t + 1 - run > rules.c1[k] + rules.c2[k])
-            new = np.where(done, full + 1, run)
-        else:
-            done = np.full(len(before), true and bool(rules.a[k] <= t <= rules.b[k]))
-            late = ~done & (t >= rules.b[k])
-            new = done.astype(np.int64)
-        after += stride[k] * np.where(settled, full + 1, new)
-        broken |= ~settled & late
-    return np.where(broken, BROKEN_STATE, after)
+    count = rules.kind.shape[0]
+    status, run, predicates = np.empty(count, np.int8), np.empty(count, np.int64), np.empty(count)
+    after = np.empty(states, np.int64)
+    for before in range(states):
+        for k in range(count):
+            digit = before // stride[k] % (dwell[k] + 2) if stride[k] > 0 else 1  # an `always` counts apart
+            status[k], run[k] = SETTLED if digit > dwell[k] else PENDING, digit
+            predicates[k] = np.inf if holds >> k & 1 else -np.inf
+        advance(rules, t, predicates, status, run)
+        after[before] = BROKEN_STATE if is_broken(status) else number_of(stride, dwell, status, run)
+    return after
 
 
 def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, row: Int32s) -> Bytes:
@@ -80,12 +71,12 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
 
     holds [K, ny, nx, H]; row [ny, nx]: of each cell in B, -1 for none.
     """
-    states = state_count(rules)
+    states, digits = state_count(rules), digits_of(rules)
     used = row >= 0
-    pattern = np.zeros(lattice.valid.shape, np.int64)
+    held = np.zeros(lattice.valid.shape, np.int64)
     for k in range(len(rules.kind)):
-        pattern |= holds[k].astype(np.int64) << k
-    patterns, of = np.unique(pattern[used], return_inverse=True)
+        held |= holds[k].astype(np.int64) << k
+    patterns, of = np.unique(held[used], return_inverse=True)
     of = of.reshape(-1, lattice.headings)
     bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
     valid: Bytes = lattice.valid[used]
@@ -95,7 +86,9 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
         asked = sum(
             1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
         )
-        after = np.array([transitions(rules, t, int(p)) for p in patterns], np.int64).reshape(-1, states)
+        after = np.empty((len(patterns), states), np.int64)
+        for n, pattern in enumerate(patterns):
+            after[n] = transitions(rules, *digits, states, t, pattern)
         after[(patterns & asked) != asked] = BROKEN_STATE
         before = np.zeros_like(bits[t])
         _before(bits[t], valid, of, after, before)

@@ -13,11 +13,11 @@ from safetensors.numpy import save as save_tensors
 from specshield.arrays import Bools, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.extent import COARSEST
+from specshield.policy.lattice import MAX_HEADINGS, side_of
 from specshield.policy.progress import Rules, goals_of, make_rules
 from specshield.policy.reachability.latest import LEAST_LATE, MOST_LATE, phases_of, time_tables
 from specshield.policy.reachability.stepwise import state_count, step_tables
 from specshield.policy.reachability.tables import Tables
-from specshield.policy.shape import MAX_HEADINGS, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.task import Task
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -160,23 +161,26 @@ def slack_at(
     return max(at_once, _after_dwells(guide, mask, t, corners, count, h, scratch))
 
 
+@inlined
+def number_of(stride: Ints, dwell: Ints, status: Int8s, run: Ints) -> int:
+    """The progress as one number (stepwise.py), without the `always`. stride, dwell, status, run (K,)."""
+    number = 0
+    for k in range(status.shape[0]):
+        number += stride[k] * (min(run[k], dwell[k]) if status[k] == PENDING else dwell[k] + 1)
+    return number
+
+
 @leaf
 def _steps_ahead(guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch) -> float:
     """How feasible a pose is by step tables: 0 to 1 at step t, and 0 to 1 more for each of DELAYS after which
     it would still be so. SAFE once nothing is pending, HOPELESS if it is not feasible at all.
     """
-    rules, tables, status = guide.rules, guide.tables, scratch.status
-    progress, pending = 0, False
-    for k in range(status.shape[0]):
-        if status[k] == BROKEN:
-            return HOPELESS
-        pending = pending or status[k] == PENDING
-        if rules.kind[k] != ALWAYS:
-            settled = tables.dwell[k] + 1
-            digit = min(scratch.run[k], tables.dwell[k]) if status[k] == PENDING else settled
-            progress += tables.stride[k] * digit
-    if not pending:
+    tables = guide.tables
+    if is_broken(scratch.status):
+        return HOPELESS
+    if PENDING not in scratch.status:
         return SAFE
+    progress = number_of(tables.stride, tables.dwell, scratch.status, scratch.run)
     v, u, h = coordinates(guide.body, tables.pitch, tables.code.shape[2], x, y, theta)
     count, ahead = find_corners(tables.cell, v, u, scratch.corners), 0.0
     for delay in DELAYS:
@@ -238,27 +242,19 @@ def is_broken(status: Int8s) -> bool:
 
 @inlined
 def score(
-    guide: Guide,
-    x: float,
-    y: float,
-    theta: float,
-    cos: float,
-    sin: float,
-    t: int,
-    last: int,
-    some: tuple[int, int],
-    scratch: Scratch,
+    guide: Guide, x: float, y: float, theta: float, t: int, last: int, some: tuple[int, int], scratch: Scratch
 ) -> int:
     """Writes L where each motion from x_t ends if it meets nothing into scratch.scores, without the progress
     of that step: a cheap order in which to try motions. To the last bit, `slack_at` then has the same of
     motions that change no progress.
 
-    cos, sin: of theta. last: the motion before, -1 for none; motions that lead straight back are HOPELESS,
-    since the tables err by a little. some: the first motion that is scored, and the stride to the next;
-    others are HOPELESS. Writes the corners about (x, y) into scratch.corners and returns how many there are,
-    UNKNOWN if they were not needed.
+    last: the motion before, -1 for none; motions that lead straight back are HOPELESS, since the tables err
+    by a little. some: the first motion that is scored, and the stride to the next; others are HOPELESS.
+    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN if they were
+    not needed.
     """
     body, _, tables, wait, _ = guide
+    cos, sin = math.cos(theta), math.sin(theta)
     scores, mask = scratch.scores, settled_goals(tables, scratch.status)
     if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
         scores[:] = SAFE

@@ -6,24 +6,14 @@ predicate says so. This runs once for each first motion of each decision, so not
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import inlined, leaf
-from specshield.policy.detour import join
 from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
-from specshield.policy.reachability.guide import (
-    copy_progress,
-    fill,
-    is_over,
-    predicate_at,
-    read_due,
-    update_progress,
-)
+from specshield.policy.reachability.guide import copy_progress, fill, is_over, predicate_at, read_due
 from specshield.policy.reachability.tables import (
     HOPELESS,
     SAFE,
@@ -66,8 +56,7 @@ def climb(
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     high, high_n = -np.inf, n
     while n < steps and not is_over(rules, tables, t + n, status):
-        cos, sin = math.cos(theta), math.sin(theta)
-        score(guide, x, y, theta, cos, sin, t + n, motions[n - 1], (0, 1), scratch)
+        score(guide, x, y, theta, t + n, motions[n - 1], (0, 1), scratch)
         gained = n == high_n or scores[wait] > high + CLIMB_GAIN
         for k in range(k_count):
             gained = gained or status[k] != scratch.high_status[k]
@@ -239,53 +228,3 @@ def _deepen(
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
         n += 1
     return n
-
-
-@leaf
-def rejoin(
-    guide: Guide,
-    t: int,
-    turn: int,
-    move: int,
-    base: Ints,
-    led: Floats,
-    at: int,
-    motions: Ints,
-    poses: Floats,
-    scratch: Scratch,
-) -> bool:
-    """Goes on from motions[:1] by `turn` and `move`, then by `base`, a way to every goal: see `join`.
-
-    led (T - t, 3): the poses of `base`, which are taken over from where the robot is at the very same pose.
-    The robot may be only nearly on that way, so the result says whether every goal was settled. The other
-    arguments are those of `climb`.
-    """
-    body, rules, tables, wait, _ = guide
-    join(turn, move, base, at, wait, motions)
-    x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
-    n, looked, joined = 1, False, 1 + (turn >= 0) + (move >= 0)
-    while n < motions.shape[0] and not is_over(rules, tables, t + n, scratch.status):
-        if is_broken(scratch.status):
-            break
-        if motions[n] != wait:
-            known = False
-            if n >= joined:  # `base` has the same motions in the same order, waits apart
-                while base[at] == wait:
-                    at += 1
-                known = at > 0 and led[at - 1, 0] == x and led[at - 1, 1] == y and led[at - 1, 2] == theta
-                at += 1
-            if known:
-                x, y, theta = led[at - 1, 0], led[at - 1, 1], led[at - 1, 2]
-            else:
-                x, y, theta = step(body, x, y, theta, motions[n])
-            update_progress(rules, t + n + 1, x, y, theta, scratch)
-            looked = False
-        else:
-            if not looked:
-                read_due(rules, t + motions.shape[0], x, y, theta, scratch)
-            looked = True
-            advance(rules, t + n + 1, scratch.predicates, scratch.status, scratch.run)
-        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-        n += 1
-    fill(n, wait, motions, poses)
-    return goals_settled(rules, scratch.status)

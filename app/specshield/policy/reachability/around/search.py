@@ -21,8 +21,7 @@ from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import Boxed, kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
-from specshield.policy.progress.recall import Past, resume
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Past, Rules, advance, resume
 from specshield.policy.reachability.around.field import spare_on
 from specshield.policy.reachability.guide import (
     copy_progress,
@@ -44,7 +43,7 @@ from specshield.policy.reachability.tables import (
     slack_at,
 )
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
-from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
+from specshield.policy.tree import Grain, Tree, enter, make_tree, pop, push, put, trace
 from specshield.policy.undo import IMPOSSIBLE, turning_motion
 from specshield.robot.contact import overlap
 from specshield.robot.dynamics import around, longest_motions, motion_count, simulate, step, step_from
@@ -54,8 +53,7 @@ POSES = 16_384  # that one search may make, in some 10 ms
 FEWER = 2_048  # the same, if one decision tries several maps
 INSIDE = 128  # the same, from inside an obstacle or off the map, where each pose costs up to 190 us
 ONWARD = 0.3  # [steps] of slack that a step farther on its way is worth
-PLACE_GRAIN = 20.0  # [1/m] places that are equal after multiplying by this and rounding down count once
-HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
+GRAIN = Grain(20.0, 1.0, 60.0 / (2.0 * math.pi))  # poses count once within 5 cm and 6 degrees
 BAND = -3.0  # [steps] of slack: how far the tables may err
 NO_WAY, GAVE_UP = -1, -2  # in place of a way: all poses were searched; there were too many of them
 LEGS = 8  # searches for one way, each to the next goal
@@ -88,8 +86,8 @@ def go_around(
     can do without. poses (M, T - t, 3): overwritten.
     """
     guide, (count, steps) = guided(boxed, margin), motions.shape
-    starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
-    now, t = starts.now, starts.now.t
+    starts = begin(guide, past, np.ones(count, np.bool_), motions, poses)
+    now, t, scratch = starts.now, starts.now.t, starts.scratch
     inside = overlap(guide.body, now.pose[0], now.pose[1], now.pose[2]) >= guide.body.radius
     most = min(most, INSIDE) if inside else most
     tree = make_tree(most, guide.rules.kind.shape[0])
@@ -122,7 +120,7 @@ def go_around(
         if m == way[0]:
             copy_row(way, motions[m])
         elif guide.wait >= 0:
-            go_back(guide, t, m, way, led, starts, scratch)
+            go_back(guide, m, way, led, starts)
         elif starts.turn[m] != IMPOSSIBLE:
             join(starts.turn[m], starts.move[m], way, 0, guide.wait, motions[m])
     return int(way[0])
@@ -200,7 +198,7 @@ def _reach(
                 continue
             put(tree, count, x, y, theta, s + 1, here, m)
             copy_progress(scratch.status, scratch.run, tree.status[count], tree.run[count])
-            slot = _slot_of(tree, count)
+            slot = enter(tree, count, GRAIN, True)
             if slot < 0:
                 continue
             if stays and corners == UNKNOWN:
@@ -210,7 +208,7 @@ def _reach(
             ahead = slack_at(guide, x, y, theta, t + s + 1, scratch, about, known)
             spare, most = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             if (ahead < BAND and bounded) or (most < 0.0 and timed):
-                tree.table[slot] = -1  # it is the last of its chain, so it can go; its row is used again
+                tree.table[slot] = -1  # its row is used again
                 continue
             ahead = max(ahead, BAND) if guide.wait >= 0 or ahead >= SAFE or spare == math.inf else spare
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
@@ -248,28 +246,3 @@ def _has_time(rules: Rules, t: int, status: Int8s, run: Ints, goal: int) -> bool
         if k != goal and rules.kind[k] != ALWAYS and status[k] == PENDING and due(rules, k) <= until:
             return False
     return True
-
-
-@leaf
-def _slot_of(tree: Tree, i: int) -> int:
-    """Puts row `i` into the tree's table and returns its slot; -1 if an earlier row has the same place,
-    heading and progress in as few motions.
-    """
-    x, y, h = _rounded(tree.pose, i)
-    slot: int = first_slot(tree, x * 73856093 ^ y * 19349663 ^ h * 83492791)
-    while tree.table[slot] >= 0:
-        other = tree.table[slot]
-        same = _rounded(tree.pose, other) == (x, y, h)
-        for k in range(tree.status.shape[1]):
-            same = same and tree.status[i, k] == tree.status[other, k]
-        if same and tree.made[other] <= tree.made[i]:
-            return -1
-        slot = (slot + 1) & (tree.table.shape[0] - 1)
-    tree.table[slot] = i
-    return slot
-
-
-@leaf
-def _rounded(pose: Floats, i: int) -> tuple[int, int, int]:
-    x, y, h = PLACE_GRAIN * pose[i, 0], PLACE_GRAIN * pose[i, 1], HEADING_GRAIN * pose[i, 2]
-    return math.floor(x), math.floor(y), math.floor(h + 0.5)

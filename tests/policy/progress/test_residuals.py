@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specshield.policy.progress.recall import residuals
+from specshield.policy.progress import residuals
 from specshield.stl import parse
 
 
