@@ -29,7 +29,7 @@ from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest
 from specshield.service.sessions import chain, record, rules
-from specshield.service.sessions.config import asked_by, asked_for, stored
+from specshield.service.sessions.rules import Rule, asked_by, asked_for, stored
 from specshield.service.sessions.session import (
     RACES,
     Session,
@@ -55,7 +55,7 @@ from specshield.shield.signals import any_signal
 from specshield.world.learned import LearnedMap
 
 R = TypeVar("R")
-Begun = tuple[dict[str, Any], State, Floats]  # the config, the state but for `expires_at`, the first row
+Begun = tuple[Rule, State, Floats]  # the state but for `expires_at`, the first row
 
 
 class Sessions:
@@ -107,17 +107,17 @@ class Sessions:
         except Exception:  # where a policy was deleted meanwhile, that is the error to tell of
             await self._policies.still_there(ids, key.name)
             raise
-        config, state, rows = begun
+        rule, state, rows = begun
         state = msgspec.structs.replace(state, expires_at=time.time() + self._settings.session_ttl)
-        stored_as = scoped(key.name, config["id"])
+        stored_as = scoped(key.name, rule.id)
         change = Change(state.packed(), pack(rows))
-        await self._store.create(stored_as, files.to_json(config), change, *limits)
+        await self._store.create(stored_as, rules.line(rule), change, *limits)
         try:  # a deletion of a policy sees this session from now on; an earlier one has left a mark
-            await self._policies.still_there(config["policy_ids"], key.name)
+            await self._policies.still_there(rule.policy_ids, key.name)
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
-        return describe([config], state)
+        return describe([rule], state)
 
     def _checked(self, request: SessionRequest) -> Config:
         """The session's settings. Raises InputError for settings that are not allowed."""
@@ -163,7 +163,7 @@ class Sessions:
             session = Session.of(there(await self._store.load(id), id))
             state = session.state
             if request.t is not None and request.poses is not None:
-                check_last(request.t, session.config["max_steps"] + 1)  # where the last step led
+                check_last(request.t, session.rule.max_steps + 1)  # where the last step led
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise session.over(request.t)
@@ -187,7 +187,7 @@ class Sessions:
     def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
         session = self._shields.settled(session)
         try:
-            return session, *self._shields.verdict(session.config, session.rows, session.signal_names)
+            return session, *self._shields.verdict(session.rule, session.rows, session.signal_names)
         except NotFound:  # the map of a session that has ended may have been deleted
             if not session.state.finished:
                 raise
@@ -209,17 +209,17 @@ class Sessions:
         session = Session.of(there(await self._store.load(id), id))
         return await self._run(session.learned)
 
-    async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes, LearnedMap]:
-        """What a picture needs: the session's config, its last step, the rows since it came to its map, the
+    async def last(self, id: str) -> tuple[Rule, int, Floats, bytes, LearnedMap]:
+        """What a picture needs: the session's rule, its last step, the rows since it came to its map, the
         record of the last step, b"" if the rule in force did not decide that, and what it learned of the map.
         """
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
         t = len(session.rows) - 1
-        decided = rules.begins(session.config) <= t < len(found.steps)
-        came = (rules.begins(b) for a, b in pairwise(session.rules) if a["map_id"] != b["map_id"])
+        decided = session.rule.begins <= t < len(found.steps)
+        came = (b.begins for a, b in pairwise(session.rules) if a.map_id != b.map_id)
         rows = session.rows[max(came, default=0) :]
-        return dict(session.config), t, rows, found.steps[t] if decided else b"", session.state.learned
+        return session.rule, t, rows, found.steps[t] if decided else b"", session.state.learned
 
     async def using(self, owner: str, policy_id: str) -> str | None:
         """The id of a session of this owner, in the store or the archive, that still needs this policy."""
@@ -229,7 +229,7 @@ class Sessions:
             for config, state in found:
                 had, now = rules.read(config), State.of(state)
                 if not now.finished and policy_id in needed(had, now):
-                    return str(had[-1]["id"])
+                    return had[-1].id
             if after is None:
                 return None
 
@@ -270,26 +270,25 @@ def begin(
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
     status, _ = episode.close(shield, rows[:, :3], rules.signals_in(rows, signals))
-    config = {
-        "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
+    rule = Rule(
+        id=request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
         **asked_by(ids, about, task),
-        **stored(settings, request),
-        "shaping": request.shaping,
-        "max_steps": shield.max_steps,
-        "created_at": files.now(),
-        "owner": owner,
-        "nonce": secrets.token_hex(8),
-        "version": __version__,
-        "way": (way or b"").hex(),
-    }
+        **{**stored(settings, request), "max_steps": shield.max_steps},
+        shaping=request.shaping,
+        created_at=files.now(),
+        owner=owner,
+        nonce=secrets.token_hex(8),
+        version=__version__,
+        way=(way or b"").hex(),
+    )
     state = State(
         length=1,
         next_t=0,
         feasible=feasible,
         spec_status=status,
         expires_at=0.0,
-        head=record.digest(files.to_json(config)),
-        carry=handover.begun(rules.way(config)),
+        head=record.digest(rules.line(rule)),
+        carry=handover.begun(way),
         any_signal=any_signal(shield, rows[:, :3]),
     )
-    return config, state, rows
+    return rule, state, rows

@@ -169,7 +169,7 @@ class Steps:
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
-        ids = tuple(session.config["policy_ids"])
+        ids = tuple(session.rule.policy_ids)
         made: Decided
         if self._shields.slow(session):
             made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
@@ -177,7 +177,7 @@ class Steps:
             return made
         # A step may take long once the map is no longer the one that the policies were made for.
         learns = bool(request.occupied or request.free or session.state.has_learned)
-        pace = self._paces.get((session.config["shaping"], *ids), Pace)
+        pace = self._paces.get((session.rule.shaping, *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
             loop, asked = asyncio.get_running_loop(), (self._shields, session, request)
@@ -207,6 +207,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
+    shield, tables = shields.tables.of(session.rule.nonce, shield, state.learned)
     before, since = record.link(state.head, session.rows[state.next_t :]), session.since
     return Decided(session, *decide(shield, asked, request.t, since, names, state.carry, before, tables))

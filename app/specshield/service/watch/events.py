@@ -89,7 +89,7 @@ class Watchers:
         than this step, or it follows a switch, it is read from the store later, with all that they lack.
         """
         feed = self._feeds.get(id)
-        if feed is not None and feed.version == before and made.t >= feed.end > rules.begins(feed.rules[-1]):
+        if feed is not None and feed.version == before and made.t >= feed.end > feed.rules[-1].begins:
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
             feed.version, feed.here = after, time.monotonic()
