@@ -93,21 +93,20 @@ class Sessions:
         settings = self._checked(request)
         preference = None
         if request.shaping != PROJECTION:
-            asked = request.shaping, request.policies, request.initial_pose, key.name
-            preference = await self._shields.prepared(self._run, *asked)
+            about = request.shaping, request.policies, request.initial_pose, key.name
+            preference = await self._shields.prepared(self._run, *about)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
-        try:
-            begun: Begun  # in another process where the policies' decisions take long, else in a thread
+        asked = request, settings, preference, key.name
+        try:  # in another process where the policies' decisions take long, else in a thread
             if preference is None and await self._run(self._shields.slow_policies, ids):
-                begun = await self._heavy.decide(
-                    "begin", request, settings, key.name, session=",".join(ids), key=tuple(ids)
+                rule, state, rows = await self._heavy.decide(
+                    begin, *asked, session=",".join(ids), key=tuple(ids)
                 )
             else:
-                begun = await self._run(begin, self._shields, request, settings, preference, key.name)
+                rule, state, rows = await self._run(begin, self._shields, *asked)
         except Exception:  # where a policy was deleted meanwhile, that is the error to tell of
             await self._policies.still_there(ids, key.name)
             raise
-        rule, state, rows = begun
         state = msgspec.structs.replace(state, expires_at=time.time() + self._settings.session_ttl)
         stored_as = scoped(key.name, rule.id)
         change = Change(state.packed(), pack(rows))

@@ -7,7 +7,8 @@ import math
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from typing import Any
+from functools import cache
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -17,15 +18,18 @@ from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
 from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
+from specshield.service.heavy.uploads import policies_of
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import record, rules
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session
+from specshield.service.settings import Settings
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
+R = TypeVar("R")
 Bounds = tuple[float, float]
 Run = Callable[..., Awaitable[Any]]  # calls a function in a thread
 QUICK = ("reachability", "dqn")  # methods whose decisions take about a millisecond; others may take long
@@ -151,3 +155,13 @@ class Shields:
         if found is None and (self._latest is None or self._latest.done()):
             found = self._prepare(name, ids, shield, session.poses[-1])
         return found.result() if found is not None and found.done() and found.exception() is None else None
+
+
+@cache
+def _own(settings: Settings) -> Shields:
+    return Shields(policies_of(settings), settings.shield_cache)
+
+
+def call(settings: Settings, function: Callable[..., R], *arguments: Any) -> R:
+    """Calls the function in a process for decisions (heavy/heavy.py), with the shields of that process."""
+    return function(_own(settings), *arguments)

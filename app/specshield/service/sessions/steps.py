@@ -170,9 +170,9 @@ class Steps:
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
         ids = tuple(session.rule.policy_ids)
-        made: Decided
         if self._shields.slow(session):
-            made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
+            asked = timed, session, request
+            made, seconds, _ = await self._heavy.decide(*asked, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
         # A step may take long once the map is no longer the one that the policies were made for.
@@ -180,8 +180,8 @@ class Steps:
         pace = self._paces.get((session.rule.shaping, *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
-            loop, asked = asyncio.get_running_loop(), (self._shields, session, request)
-            made, seconds, cpu = await loop.run_in_executor(self._threads, timed, *asked)
+            run = asyncio.get_running_loop().run_in_executor
+            made, seconds, cpu = await run(self._threads, timed, self._shields, session, request)
         elif pace.doubted:
             made, seconds, cpu = timed(self._shields, session, request)
         else:  # measuring the thread's own time would cost a tenth of the step

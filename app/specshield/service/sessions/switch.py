@@ -67,10 +67,8 @@ class Switches:
         session, ids = wanted.session, wanted.policy_ids
         shaping = session.rule.shaping
         if shaping == PROJECTION and await self._run(self._shields.slow_policies, ids):
-            made: Session = await self._heavy.decide(
-                "switched", wanted, self._most, session=session.id, key=tuple(ids)
-            )
-            return made
+            asked = switched, wanted, self._most
+            return await self._heavy.decide(*asked, session=session.id, key=ids)
         if shaping != PROJECTION:
             await self._shields.prepared(self._run, shaping, ids, wanted.row[:3].tolist(), owner)
         here: Session = await self._run(switched, self._shields, wanted, self._most)
