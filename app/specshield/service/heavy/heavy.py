@@ -56,14 +56,12 @@ class Heavy:
             gone.cancel()
             await asyncio.gather(work, gone, return_exceptions=True)
 
-    async def decide(
-        self, function: Callable[..., R], *arguments: Any, session: str, key: Sequence[str]
-    ) -> R:
+    async def decide(self, function: Callable[..., R], *args: Any, session: str, key: Sequence[str]) -> R:
         """Calls a function with `Shields` of the other process first, when it is the session's turn.
 
         key: names what the process has to prepare, such as the policies: it is kept for further calls.
         """
-        asked = "specshield.service.sessions.shields:call", self._settings, function, *arguments
+        asked = "specshield.service.sessions.shields:call", self._settings, function, *args
         made: R = await self.decisions.run(*asked, seconds=DECISION_TIMEOUT, owner=session, key=tuple(key))
         return made
 

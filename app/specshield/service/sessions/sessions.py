@@ -99,9 +99,7 @@ class Sessions:
         asked = request, settings, preference, key.name
         try:  # in another process where the policies' decisions take long, else in a thread
             if preference is None and await self._run(self._shields.slow_policies, ids):
-                rule, state, rows = await self._heavy.decide(
-                    begin, *asked, session=",".join(ids), key=tuple(ids)
-                )
+                rule, state, rows = await self._heavy.decide(begin, *asked, session=",".join(ids), key=ids)
             else:
                 rule, state, rows = await self._run(begin, self._shields, *asked)
         except Exception:  # where a policy was deleted meanwhile, that is the error to tell of
