@@ -16,12 +16,11 @@ from starlette.types import Receive, Scope, Send
 from specshield import __version__
 from specshield.service import pages, problems
 from specshield.service.access.keys import Keys
-from specshield.service.bounds import body
-from specshield.service.bounds.bodies import Bodies
+from specshield.service.bounds import bodies
 from specshield.service.bounds.protocol import raise_file_limit
 from specshield.service.description import TAGS, described
 from specshield.service.heavy.heavy import Heavy
-from specshield.service.leaving import drain_at_sigterm
+from specshield.service.leaving import heed_signals
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
@@ -67,7 +66,7 @@ class Application:
         self.routes = routes
         steps = StepRoute(StreamRoute(routes))
         # The guard comes before the bodies: nothing is read of a request that it refuses.
-        self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
+        self._around = Observe(Guard(bodies.Bodies(steps, settings), settings.hosts))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = self.routes
@@ -136,10 +135,9 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     server = Server(
         settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys
     )
-    body.clear(settings.data_dir / "incoming")
+    bodies.clear(settings.data_dir / "incoming")
     app.state.server = server
-    server.streams.close_at_stop()  # before the next line, whose handler calls this one after the drain
-    drain_at_sigterm(startup, settings.drain)
+    heed_signals(startup, server.streams, settings.drain)
     running = (
         prepare(startup, check),
         *([complete(startup)] if settings.complete else []),

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 
 from specshield.service.access.owners import Caller, Owner
-from specshield.service.bounds.body import received
+from specshield.service.bounds.bodies import received
 from specshield.service.heavy.uploads import FILES
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.specs import MapList, MapResponse

@@ -13,7 +13,7 @@ from specshield.policy.methods import METHODS
 from specshield.service import examples
 from specshield.service.access.keys import Key
 from specshield.service.access.owners import Caller, Owner
-from specshield.service.bounds.body import received
+from specshield.service.bounds.bodies import received
 from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.maps import undeletable
 from specshield.service.library.policies import Record
