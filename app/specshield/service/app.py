@@ -26,8 +26,7 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe
 from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
-from specshield.service.routes.steps import StepRoute
-from specshield.service.routes.stream import StreamRoute
+from specshield.service.routes.steps import StepRoutes
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
@@ -64,7 +63,7 @@ class Application:
 
     def __init__(self, routes: FastAPI, settings: Settings) -> None:
         self.routes = routes
-        steps = StepRoute(StreamRoute(routes))
+        steps = StepRoutes(routes)
         # The guard comes before the bodies: nothing is read of a request that it refuses.
         self._around = Observe(Guard(bodies.Bodies(steps, settings), settings.hosts))
 
