@@ -44,9 +44,7 @@ class Settings(BaseSettings):
     store_timeout: Seconds = 2.0  # longest wait for the store
     # How many replicas of the store at REDIS_URL need to have a step before it is answered.
     store_replicas: int = Field(0, ge=0, le=8)
-    api_key: SecretStr | None = (
-        None  # a key for `Authorization: Bearer <key>`, beside those of `specshield keys`
-    )
+    api_key: SecretStr | None = None  # for `Authorization: Bearer <key>`, beside those of `specshield keys`
     # Whether a server refuses everybody, rather than nobody, while its store has no key. `serve` sets it
     # where other machines reach the server.
     ask_for_key: bool = False
@@ -60,9 +58,8 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(64 << 20, ge=1024)  # largest map or policy sent
     max_bodies_bytes: int = Field(128 << 20, ge=1 << 20)  # most for all bodies that are being received
     max_body_members: int = Field(10_000, ge=100)  # most members of objects in a JSON body, uploads excepted
-    max_spec_bytes: int = Field(
-        256 << 10, ge=1024
-    )  # of a policy's spec, and of a map's rooms' outlines, as JSON
+    # Largest spec of a policy, and largest outlines of a map's rooms, as JSON.
+    max_spec_bytes: int = Field(256 << 10, ge=1024)
     max_header_bytes: int = Field(32 << 10, ge=1024)  # largest head of a request
     max_connections: int = Field(2000, ge=8)  # most connections at once to one server process
     request_timeout: Seconds = 15.0  # longest for a head or body to arrive, and for an unread answer
