@@ -12,8 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
-from specshield.service.access.keys import MISS_EVERY, OPEN, REFRESH, Key, Keys
-from specshield.service.access.rates import Rates
+from specshield.service.access.keys import MISS_EVERY, OPEN, REFRESH, Key, Keys, Rates
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
 from tests.service.test_bad_input import problem

@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specshield.errors import NotFound, SpecshieldError, Stopping
 from specshield.service import metrics, problems
-from specshield.service.access.rates import Rates
+from specshield.service.access.keys import Rates
 from specshield.service.access.site import check_site
 from specshield.service.routes.steps import STREAM
 from specshield.service.watch import logs

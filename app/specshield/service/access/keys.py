@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
-from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
+from specshield.errors import InputError, LimitReached, NotFound, RateLimited, StoreError, Unauthorized
 from specshield.service.library.files import now
 from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.storage.connect import reaching
@@ -154,6 +154,32 @@ class Keys:
         """Revokes a key. What was made with it belongs to the next key of this name. Raises NotFound."""
         if not name or await _reached(self._store.eval(REVOKE, 1, KEYS, name, secrets.token_hex(8))) is None:
             raise NotFound("there is no such key", path="name", got=name, expected="a name in `keys list`")
+
+
+class Rates:
+    """Limits the requests that a key may make in a second. Steps have their own bucket of tokens, so that the
+    robots of a key go on whatever else the key is used for. A bucket is the number of requests that were
+    left, at most those of a second, and when that was [s].
+    """
+
+    def __init__(self) -> None:
+        self._buckets: dict[tuple[str, bool], tuple[float, float]] = {}  # by the key's name, and for steps
+
+    def take(self, key: Key, step: bool) -> None:
+        """Counts a request. Raises RateLimited, with the seconds to wait."""
+        rate = key.requests
+        if rate is None:
+            return
+        now, most = time.monotonic(), max(1.0, rate)
+        left, then = self._buckets.get((key.name, step), (most, now))
+        left = min(most, left + (now - then) * rate)
+        if left < 1.0:
+            raise RateLimited(
+                f"the key {key.name!r} may make {rate:g} requests in a second",
+                expected="the request again after Retry-After",
+                retry_after=math.ceil((1.0 - left) / rate),
+            )
+        self._buckets[key.name, step] = left - 1.0, now
 
 
 OPEN = Key("", "")  # stands for all callers of a server that asks for no key
