@@ -181,7 +181,7 @@ def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete
 
 def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_compiled(tmp_path):
     startup = Startup(completing=True)
-    shields = Shields(policies_of(Settings(data_dir=tmp_path)), 10, startup.has)
+    shields = Shields(policies_of(Settings(data_dir=tmp_path)), startup.has)
     learned, computed = (shields.policies.find(name, "").id for name in ("case1-dqn", "case1"))
     assert shields.slow_policies([learned])
     assert not shields.slow_policies([computed])

@@ -57,7 +57,6 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(1 << 20, ge=1024)  # largest request body
     max_upload_bytes: int = Field(64 << 20, ge=1024)  # largest map or policy sent
     max_bodies_bytes: int = Field(128 << 20, ge=1 << 20)  # most for all bodies that are being received
-    max_body_members: int = Field(10_000, ge=100)  # most members of objects in a JSON body, uploads excepted
     # Largest spec of a policy, and largest outlines of a map's rooms, as JSON.
     max_spec_bytes: int = Field(256 << 10, ge=1024)
     max_header_bytes: int = Field(32 << 10, ge=1024)  # largest head of a request
@@ -85,7 +84,6 @@ class Settings(BaseSettings):
     max_owner_archive_bytes: Count = 50 << 30
     # How long a server that was told to stop goes on answering, except at /readyz [s].
     drain: float = Field(0.0, ge=0, le=3600)
-    shield_cache: Count = 32  # prepared shields kept in memory
 
     max_watchers: AnyCount = 1000  # most open streams of events, for each server process
     log_format: Literal["text", "json"] = "text"  # lines of the log, for people or for programs

@@ -29,6 +29,7 @@ LONG = ("/steps", "/close", "/switch", "/validate")  # bodies with a history, or
 FREE = 64 << 10  # [bytes] of each body that the budget does not count, so that steps are always taken
 IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they are written to its file
 LONG_JSON = 16 << 10  # [bytes]; a shorter body has no room for many members
+MEMBERS = 10_000  # of all objects in a body that is no upload, at most; chosen by hand
 
 
 class Budget:
@@ -107,12 +108,8 @@ class Bodies:
     """Puts the `Body` of an upload into `scope["state"]["body"]`; other routes get theirs in one message."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self.app = app
-        self._folder = settings.data_dir / "incoming"
-        self._budget = Budget(settings.max_bodies_bytes)
-        self._max_body, self._max_upload = settings.max_body_bytes, settings.max_upload_bytes
-        self._members, self._patience = settings.max_body_members, settings.request_timeout
-        self._slowest, self._short = settings.min_body_rate, min(settings.max_body_bytes, LONG_JSON)
+        self.app, self._settings, self._budget = app, settings, Budget(settings.max_bodies_bytes)
+        self._folder, self._short = settings.data_dir / "incoming", min(settings.max_body_bytes, LONG_JSON)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not _has_body(scope):
@@ -131,7 +128,7 @@ class Bodies:
                     scope["state"]["status"] = CLIENT_GONE
                     return
                 if not upload:
-                    self._check_members(body.content)
+                    _check_members(body.content)
             except SpecshieldError as error:
                 # The rest of the body is not read.
                 await problems.ProblemResponse(error, {"Connection": "close"})(scope, receive, send)
@@ -154,18 +151,19 @@ class Bodies:
 
     def _limit(self, path: str) -> int:
         if path in UPLOADS:
-            return self._max_upload
-        return self._max_body if path.endswith(LONG) else min(self._max_body, FREE)
+            return self._settings.max_upload_bytes
+        most = self._settings.max_body_bytes
+        return most if path.endswith(LONG) else min(most, FREE)
 
     async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
         """Receives a body of at most `limit` bytes. False if the client has left."""
         announced = _header(scope, b"content-length") or "0"
         if announced.isdigit() and int(announced) > limit:
             raise _too_large(limit)
-        loop = asyncio.get_running_loop()
-        begun = loop.time()
+        loop, patience = asyncio.get_running_loop(), self._settings.request_timeout
+        begun, slowest = loop.time(), self._settings.min_body_rate
         try:
-            async with asyncio.timeout_at(begun + self._patience) as deadline:
+            async with asyncio.timeout_at(begun + patience) as deadline:
                 while True:
                     message = await receive()
                     if message["type"] == "http.disconnect":
@@ -177,22 +175,12 @@ class Bodies:
                     if not message.get("more_body", False):
                         await body.end()
                         return True
-                    deadline.reschedule(begun + self._patience + body.size / self._slowest)
+                    deadline.reschedule(begun + patience + body.size / slowest)
         except TimeoutError:
             raise RequestTimeout(
                 f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
-                expected=f"all of it within {self._patience:g} s and 1 s more for each {self._slowest} bytes",
+                expected=f"all of it within {patience:g} s and 1 s more for each {slowest} bytes",
             ) from None
-
-    def _check_members(self, content: bytes | Path) -> None:
-        """Raises InputError for too many members: a schema makes an error for each unknown one."""
-        if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > self._members:
-            raise InputError(
-                "the body has too many members",
-                path="body",
-                got=content.count(b":"),
-                expected=f"at most {self._members}, where colons in texts count too",
-            )
 
 
 def received(request: Request) -> Body:
@@ -207,6 +195,17 @@ def clear(folder: Path) -> None:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime < time.time() - 3600:
                 path.unlink()
+
+
+def _check_members(content: bytes | Path) -> None:
+    """Raises InputError for too many members: a schema makes an error for each unknown one."""
+    if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > MEMBERS:
+        raise InputError(
+            "the body has too many members",
+            path="body",
+            got=content.count(b":"),
+            expected=f"at most {MEMBERS}, where colons in texts count too",
+        )
 
 
 def _too_large(limit: int) -> BodyTooLarge:

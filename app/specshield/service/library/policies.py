@@ -64,8 +64,7 @@ class Policies(Claimed):
 
     def __init__(self, settings: Settings, maps: Maps) -> None:
         super().__init__("policies", maps.given, settings)
-        self._maps, self._models = maps, settings.models_dir
-        self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
+        self._maps = maps
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
 
@@ -105,7 +104,7 @@ class Policies(Claimed):
         try:
             regions, signals = spec.get("regions"), spec.get("signals")
             return make_task(
-                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._max_horizon
+                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._settings.max_horizon
             )
         except FormulaError as error:
             raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None
@@ -123,7 +122,7 @@ class Policies(Claimed):
             raise PolicyError(told, path="policy_id", got=record.id, expected=expected)
         task = self.task(record.about)
         if record.name is not None:
-            return load_policy(self._models / record.name / WEIGHTS, record.card, task)
+            return load_policy(self._settings.models_dir / record.name / WEIGHTS, record.card, task)
         return load_policy(self._kept.file(record.id, WEIGHTS), record.card, task)
 
     def resolve(self, about: Description, owner: str) -> Description:
@@ -139,9 +138,9 @@ class Policies(Claimed):
             if spec.get(kind):
                 spec[kind] = {name: value for name, value in spec[kind].items() if name in used}
         size = len(files.to_json(spec))
-        if size > self._max_spec:
+        if size > (most := self._settings.max_spec_bytes):
             told = "the spec is too large"
-            expected = f"at most {self._max_spec} bytes; only regions that the formula names count"
+            expected = f"at most {most} bytes; only regions that the formula names count"
             raise InputError(told, path="spec", got=f"{size} bytes as JSON", expected=expected)
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
@@ -250,7 +249,7 @@ class Policies(Claimed):
         return [record for record in found if record is not None], following
 
     def _shipped(self) -> Iterator[Record]:
-        for path in sorted(self._models.glob("*/card.json")):
+        for path in sorted(self._settings.models_dir.glob("*/card.json")):
             try:
                 card = json.loads(path.read_bytes())
                 about = describe(card)

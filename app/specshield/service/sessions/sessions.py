@@ -73,7 +73,7 @@ class Sessions:
         is_compiled: Callable[[str], bool],
     ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
-        self._shields = Shields(policies, settings.shield_cache, is_compiled)
+        self._shields = Shields(policies, is_compiled)
         self._threads = ThreadPoolExecutor(cores(), "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, self._shields, self._run, heavy, settings)

@@ -32,6 +32,7 @@ from specshield.shield.preference import Preference
 R = TypeVar("R")
 Bounds = tuple[float, float]
 Run = Callable[..., Awaitable[Any]]  # calls a function in a thread
+SHIELDS = 32  # kept in memory; chosen by hand
 QUICK = ("reachability", "dqn")  # methods whose decisions take about a millisecond; others may take long
 
 
@@ -40,15 +41,13 @@ class Shields:
     decision waits for it.
     """
 
-    def __init__(
-        self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda part: True
-    ) -> None:
-        """room: for so many shields. is_compiled: whether the kernels of a part of warmup.LATER are compiled,
-        so that decisions need not do it. A method that is quick once they are is called like its part.
+    def __init__(self, policies: Policies, is_compiled: Callable[[str], bool] = lambda part: True) -> None:
+        """is_compiled: whether the kernels of a part of warmup.LATER are compiled, so that decisions need not
+        do it. A method that is quick once they are is called like its part.
         """
         self.policies, self._is_compiled = policies, is_compiled
-        self._shields = files.Recent[Shield](room)
-        self._judges = files.Recent[Shield](room)  # shields without policies, for verdicts, by digest
+        self._shields = files.Recent[Shield](SHIELDS)
+        self._judges = files.Recent[Shield](SHIELDS)  # shields without policies, for verdicts, by digest
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self.tables = Tables()
@@ -159,7 +158,7 @@ class Shields:
 
 @cache
 def _own(settings: Settings) -> Shields:
-    return Shields(policies_of(settings), settings.shield_cache)
+    return Shields(policies_of(settings))
 
 
 def call(settings: Settings, function: Callable[..., R], *arguments: Any) -> R:

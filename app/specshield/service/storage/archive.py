@@ -111,22 +111,15 @@ class Archive:
     def remove(self, entry: Entry) -> None:
         self._objects.remove(entry.path)
 
-    def remove_older(self, entry: Entry) -> int:
-        """Removes the older files of the session. Returns their bytes."""
+    def erase(self, key: str, before: Entry | None = None) -> int:
+        """Removes the files of a session, all of them or those that are older. Returns their bytes."""
         gone = 0
-        for path, size in self._objects.sizes(_folder(entry.key)):
-            other = Entry.of(entry.key, path.rpartition("/")[2])
-            if other is not None and other < entry:
-                self.remove(other)
+        for path, size in self._objects.sizes(_folder(key)):
+            entry = Entry.of(key, path.rpartition("/")[2])
+            if entry is not None and (before is None or entry < before):
+                self.remove(entry)
                 gone += size
         return gone
-
-    def erase(self, key: str) -> int:
-        """Removes all files of a session. Returns their bytes, 0 if there was none."""
-        size = sum(size for _, size in self._objects.sizes(_folder(key)))
-        for entry in self.entries(key):
-            self.remove(entry)
-        return size
 
     def after(self, owner: str, id: str | None) -> Iterator[Entry]:
         """The latest file of each session of an owner that has not expired, in order of id, after this id."""

@@ -200,7 +200,7 @@ class ArchivingStore(Store):
             if left > 0:
                 await self.take_off([id.encode()])
         if left > 0:
-            size -= await self.in_thread(self.archive.remove_older, entry)
+            size -= await self.in_thread(self.archive.erase, id, entry)
         else:
             await self.in_thread(self.archive.remove, entry)
             size = 0
