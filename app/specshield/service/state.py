@@ -52,7 +52,7 @@ class Server:
     streams: Streams = field(default_factory=Streams)
 
 
-def _server(request: Request) -> Server:
+async def _server(request: Request) -> Server:
     server: Server = request.app.state.server
     return server
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from specshield.service.access.keys import OPEN, Key
+from specshield.service.access.keys import Key
 
 
 def scoped(owner: str, id: str) -> str:
@@ -30,14 +30,16 @@ def shown(key: str) -> str:
     return key.partition("@")[2]
 
 
-def _owner(request: Request) -> str:
-    return str(request.scope["state"].get("owner", ""))
-
-
-def _caller(request: Request) -> Key:
-    key: Key = request.scope["state"].get("key", OPEN)
+async def _caller(request: Request) -> Key:
+    key: Key = request.scope["state"]["key"]
     return key
 
 
-Owner = Annotated[str, Depends(_owner)]
 Caller = Annotated[Key, Depends(_caller)]
+
+
+async def _owner(caller: Caller) -> str:
+    return caller.name
+
+
+Owner = Annotated[str, Depends(_owner)]

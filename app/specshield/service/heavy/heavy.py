@@ -43,7 +43,7 @@ class Heavy:
         """
         module, _, name = function.rpartition(":")
         asked = f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments
-        seconds, owner = self._settings.heavy_timeout, str(request.scope["state"].get("owner", ""))
+        seconds, owner = self._settings.heavy_timeout, request.scope["state"]["owner"]
         work = asyncio.ensure_future(self.tasks.run(*asked, seconds=seconds, owner=owner))
         gone = asyncio.ensure_future(until_gone(request.receive))
         try:

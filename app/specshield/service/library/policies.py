@@ -67,15 +67,22 @@ class Policies(Claimed):
         self._maps = maps
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
+        self._given = {found.id: found for found in reversed(self._named.values())} | {**self._named}
 
     def record(self, key: str) -> Record:
         """A policy by its id, whoever owns it, or one that came with the server. Raises NotFound."""
-        for found in self._named.values():
-            if key in (found.name, found.id):
-                return found
+        found = self.made_here(key)
+        if found is None:
+            raise missing("policies", key)
+        return found
+
+    def made_here(self, key: str) -> Record | None:
+        """The policy of this id, or of this name if it came with the server; None if there is none."""
+        if key in self._given:
+            return self._given[key]
         stored = self._kept.find(key, "policy.json") if files.HASH.fullmatch(key) else None
         if stored is None:
-            raise missing("policies", key)
+            return None
         card = self._kept.find(key, "card.json")
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
 
@@ -88,9 +95,8 @@ class Policies(Claimed):
 
     async def still_there(self, ids: Sequence[str], owner: str) -> None:
         """Raises NotFound if a policy was deleted. To be called once a deletion can see that it is used."""
-        shipped = {record.id for record in self._named.values()}
         for id in ids:
-            if id not in shipped and not await self.claims.settled("policies", id, owner):
+            if id not in self._given and not await self.claims.settled("policies", id, owner):
                 raise missing("policies", id)
 
     def task(self, about: Description) -> Task:
@@ -153,13 +159,6 @@ class Policies(Claimed):
     def name_of(self, record: Record, owner: str) -> str | None:
         return record.name or self.claims.name_of("policies", record.id, owner)
 
-    def made_here(self, id: str) -> Record | None:
-        """The policy of this id, if there is one."""
-        try:
-            return self.record(id)
-        except NotFound:
-            return None
-
     def add_card(
         self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
     ) -> Record:
@@ -191,8 +190,8 @@ class Policies(Claimed):
         """Keeps a policy for the owner of the key. trained: its files, if it is made already. Raises
         LimitReached and InsufficientStorage.
         """
-        if record.id in (found.id for found in self._named.values()):
-            return self.record(record.id)
+        if record.id in self._given:
+            return self._given[record.id]
         record = replace(record, created_at=files.now())
         stored = asdict(replace(record, card=None))
         del stored["card"]

@@ -31,7 +31,7 @@ PathId = Annotated[
 ]
 
 
-def _key(session_id: PathId, owner: Owner) -> str:
+async def _key(session_id: PathId, owner: Owner) -> str:
     return scoped(owner, session_id)
 
 
