@@ -15,7 +15,6 @@ from typing import Any
 import httpx
 import redis
 
-from specshield.service.access.owners import scoped
 from specshield.service.sessions import record
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State
@@ -23,6 +22,7 @@ from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
+from specshield.service.storage.store import scoped
 from specshield.service.watch.events import Watchers
 from tests.service.world import ahead
 from tests.serving import HUNG, serving, wait_for

@@ -24,11 +24,11 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from specshield.errors import InputError, ServerError, SpecshieldError
 from specshield.service import metrics, problems
-from specshield.service.access.owners import scoped
 from specshield.service.routes.messages import MSGPACK, accepts, read_step, write_problem
 from specshield.service.schemas.answers import to_json, to_msgpack
 from specshield.service.schemas.base import ID
 from specshield.service.state import Server
+from specshield.service.storage.store import scoped
 from specshield.service.watch import logs
 
 STEPS = re.compile(rf"/v1/sessions/({ID})/steps")

@@ -17,11 +17,11 @@ from itertools import islice
 import msgspec
 
 from specshield.errors import SpecshieldError
-from specshield.service.access.owners import owner_of, shown
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.objects import left_out
+from specshield.service.storage.store import owner_of, shown
 
 BATCH = 1000  # ids, or files, that are looked at together
 AT_ONCE = 4  # sessions that are moved at the same time; each waits for its file to be on the disk

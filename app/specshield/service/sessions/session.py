@@ -15,7 +15,6 @@ from specshield.errors import Conflict, InputError, NotFound, SessionFinished, S
 from specshield.handover import check_main_task
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
-from specshield.service.access.owners import shown
 from specshield.service.library import files
 from specshield.service.schemas import robots
 from specshield.service.schemas.answers import StepAnswer, to_json
@@ -25,7 +24,7 @@ from specshield.service.sessions import rules as ruled
 from specshield.service.sessions.record import Asked, StepRecord
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import Dump, Record
+from specshield.service.storage.store import Dump, Record, shown
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield
 

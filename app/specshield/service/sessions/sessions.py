@@ -22,7 +22,6 @@ from specshield.errors import InputError, LimitReached, NotFound, SpecshieldErro
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
-from specshield.service.access.owners import scoped
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
@@ -47,7 +46,7 @@ from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
-from specshield.service.storage.store import Change, Limit, exists, no_more
+from specshield.service.storage.store import Change, Limit, exists, no_more, scoped
 from specshield.shield import episode
 from specshield.shield.decision import USUAL_STEPS, Config, check_preferring
 from specshield.shield.preference import Preference
@@ -60,7 +59,7 @@ Begun = tuple[Rule, State, Floats]  # the state but for `expires_at`, the first 
 
 class Sessions:
     """All that takes long runs in threads or other processes, so that the event loop goes on. In these
-    methods the `id` of a session is its key in the store, which says whose it is (access/owners.py).
+    methods the `id` of a session is its key in the store, which says whose it is (storage/store.py).
     """
 
     def __init__(

@@ -20,9 +20,8 @@ import msgspec
 import zstandard
 
 from specshield.errors import StoreError
-from specshield.service.access.owners import scoped
 from specshield.service.storage.objects import Objects, left_out
-from specshield.service.storage.store import Dump
+from specshield.service.storage.store import Dump, scoped
 
 MAGIC = b"specshield session 1\n"
 FOLDER = 8  # characters of an id that name its folder; ids that the server makes in one minute share them

@@ -18,9 +18,19 @@ from typing import ParamSpec, TypeVar
 
 import anyio
 
-from specshield.service.access.owners import owner_of, scoped
 from specshield.service.storage.archive import Archive
-from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, exists, keys
+from specshield.service.storage.store import (
+    INDEX,
+    PAGE_BYTES,
+    Change,
+    Dump,
+    Record,
+    Store,
+    exists,
+    keys,
+    owner_of,
+    scoped,
+)
 
 P = ParamSpec("P")
 R = TypeVar("R")

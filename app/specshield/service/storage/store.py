@@ -2,8 +2,10 @@
 
 A session has three keys in one slot that expire together: `specshield:v2:{id}:session`, a hash of config,
 state and version; `:rows`, its poses and signals; `:steps`, the list of the steps' records. The `id` of a
-session is its key `owner@id` (access/owners.py). The ids are also in `specshield:sessions`, a sorted set in
-which the sessions of one owner stand together; it may still name sessions that have expired.
+session is its key `owner@id`, so two owners may choose the same id, and nobody finds the session of another
+owner. The owner is the name of the API key that made it, or "" if the server asks for no key or the key was
+that of SPECSHIELD_API_KEY. The ids are also in `specshield:sessions`, a sorted set in which the sessions of
+one owner stand together; it may still name sessions that have expired.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import anyio
 import redis
 
 from specshield.errors import LimitReached, SessionExists
-from specshield.service.access.owners import shown
 from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
@@ -257,6 +258,24 @@ class Store:
 def _range(owner: str | None) -> tuple[str, str]:
     """The bounds of an owner's names in INDEX: owner@ to before ownerA (A follows @); for None, of all."""
     return ("-", "+") if owner is None else (f"[{owner}@", f"({owner}A")
+
+
+def scoped(owner: str, id: str) -> str:
+    """
+    >>> scoped("alice", "run-1")
+    'alice@run-1'
+    """
+    return f"{owner}@{id}"
+
+
+def owner_of(key: str) -> str:
+    """The owner in a session's key."""
+    return key.partition("@")[0]
+
+
+def shown(key: str) -> str:
+    """The id, as callers know it, in a session's key."""
+    return key.partition("@")[2]
 
 
 def keys(id: str) -> list[str]:

@@ -18,13 +18,12 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from specshield.arrays import Floats
 from specshield.errors import LimitReached, NotFound, SpecshieldError
 from specshield.service import metrics
-from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import News, Store
+from specshield.service.storage.store import News, Store, shown
 from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
 # All chosen by hand.

@@ -14,14 +14,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.sessions import record, rules
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session, describe
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import News
+from specshield.service.storage.store import News, shown
 
 KEPT = 64  # events that are kept for the watchers of a session, and the most that are read at once
 
