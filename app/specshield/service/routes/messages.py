@@ -21,8 +21,8 @@ _pack = msgspec.msgpack.Encoder()
 
 
 def read_step(body: Any, packed: bool) -> StepBody:
-    """body: bytes of MessagePack if `packed`, else bytes or a text of JSON. Raises InputError, or its subclass
-    for the wrong field.
+    """body: bytes of MessagePack if `packed`, else JSON as bytes or as a text. Raises InputError, or its
+    subclass for the wrong field.
     """
     try:
         return (_msgpack if packed else _json).decode(body)
