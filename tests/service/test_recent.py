@@ -11,7 +11,7 @@ import pytest
 
 from specshield.service.app import create_app
 from specshield.service.library.files import Recent
-from specshield.service.sessions.rules import Rule, line
+from specshield.service.sessions.rules import line
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
@@ -20,7 +20,7 @@ from specshield.shield.decision import Carry
 from specshield.shield.taught import Taught
 from specshield.task import Task
 from specshield.world.learned import LearnedMap
-from tests.service.world import LOGITS, START, grid_json, policy_files
+from tests.service.world import LOGITS, START, grid_json, policy_files, rule
 
 ROUNDS = 8
 
@@ -28,12 +28,8 @@ ROUNDS = 8
 def session(formula="F[0,6] Goal", motions=4, horizon=8):
     carry = Carry(0, np.zeros((motions, 3)), (bytes(horizon),) * motions)
     state = State(1, 1, True, "pending", 0.0, b"", carry=carry)
-    rule = Rule(
-        id="a", policy_ids=[], map_id="m", spec={"formula": formula, "regions": {}, "signals": {}}, horizon=6,
-        robot="stretch", actions=[], terminal_actions=[], seed=0, threshold=1.0, margin=0.0,
-        evaluation="feasibility", max_steps=600, shaping="projection",
-    )  # fmt: skip
-    return Session.of(Record(line(rule), state.packed(), b"1", bytes(24), None))
+    told = rule(spec={"formula": formula, "regions": {}, "signals": {}})
+    return Session.of(Record(line(told), state.packed(), b"1", bytes(24), None))
 
 
 def test_the_sessions_used_last_are_kept():

@@ -45,14 +45,17 @@ def config(form: str, level: str) -> dict[str, Any]:
     own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
     loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
     formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
-    news = [lambda record: record.getMessage() not in NO_NEWS]
-    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": news}}
+    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_news]}}
     # Metrics and the lines for refused requests take the place of uvicorn's access log, which takes some 60
     # us.
     del loggers["uvicorn.access"]
     others = {"handlers": ["default"], "level": "WARNING"}  # such as rq and asyncio
     own_parts = {"formatters": formatters, "handlers": handlers, "loggers": loggers, "root": others}
     return {**LOGGING_CONFIG, **own_parts}
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return record.getMessage() not in NO_NEWS
 
 
 class Text(DefaultFormatter):
