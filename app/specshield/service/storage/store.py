@@ -63,9 +63,10 @@ class Dump(NamedTuple):
 
 
 class News(NamedTuple):
-    """A session's state, and its rows and steps, as in `Dump`, from some step on."""
+    """A session's state and version, and its rows and steps, as in `Dump`, from some step on."""
 
     state: bytes
+    version: bytes
     rows: bytes
     steps: list[bytes]
 
@@ -204,11 +205,6 @@ class Store:
                     await self.take_off(gone)
                 low = f"({ids[-1].decode()}"
 
-    async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
-        """The version of each session, None for one that the store does not have. One round trip."""
-        async with self._reaching():
-            return await self._of_each(ids, "hget", "version")
-
     async def news(self, asked: Sequence[tuple[str, int, int, int]]) -> list[News | None]:
         """For each (id, t, bytes of a row, count) what the session has from step t on, for `count` steps."""
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
@@ -216,10 +212,13 @@ class Store:
                 session, rows, steps = keys(id)
                 pipe.lrange(steps, t, t + count - 1)
                 pipe.getrange(rows, t * width, (t + count) * width - 1)  # after the steps: has all their rows
-                pipe.hget(session, "state")  # last, so that it shows a switch that made the rows wider
+                pipe.hmget(session, "state", "version")  # last: it shows a switch that made the rows wider
             found = await pipe.execute()
         three = zip(found[::3], found[1::3], found[2::3], strict=True)
-        return [None if state is None else News(state, rows, steps) for steps, rows, state in three]
+        return [
+            None if state is None else News(state, version, rows, steps)
+            for steps, rows, (state, version) in three
+        ]
 
     async def held_bytes(self) -> int | None:
         """The bytes of memory that the store takes; in a cluster all masters together, without replicas. None
