@@ -152,8 +152,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     finally:
         for task in tasks:
             task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.gather(*tasks)
+        await asyncio.gather(*tasks, return_exceptions=True)
         if worker is not None:
             await asyncio.to_thread(worker.stop)
         heavy.close()

@@ -10,15 +10,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import json
 import logging
 import math
 import re
 import secrets
 import time
 from collections.abc import Awaitable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, TypeVar
+
+import msgspec
 
 from specshield.errors import InputError, LimitReached, NotFound, RateLimited, StoreError, Unauthorized
 from specshield.service.library.files import now
@@ -127,14 +128,18 @@ class Keys:
     async def follow(self) -> None:
         """Refreshes the keys until it is cancelled."""
         while True:
-            await self.refresh()
+            try:
+                await self.refresh()
+            except Exception:  # the next one may succeed; without them no revoked key would be refused
+                log.exception("the keys cannot be read")
             await asyncio.sleep(REFRESH)
 
     # --- for the command line
 
     async def listed(self) -> list[Key]:
         found = await _reached(self._store.hgetall(KEYS))
-        return sorted((Key(**json.loads(v)) for k, v in found.items() if k), key=lambda key: key.name)
+        keys = [msgspec.json.decode(record, type=Key) for name, record in found.items() if name]
+        return sorted(keys, key=lambda key: key.name)
 
     async def create(self, name: str, **limits: Any) -> str:
         """Makes a key and returns it: it cannot be read again. Raises InputError and LimitReached."""
@@ -143,7 +148,7 @@ class Keys:
         if await _reached(self._store.hlen(KEYS)) > MOST_KEYS:
             raise LimitReached(f"there are {MOST_KEYS} keys", expected="room for one more: revoke one")
         secret = f"ss_{secrets.token_urlsafe(32)}"
-        record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
+        record = msgspec.json.encode(Key(name, digest_of(secret.encode()), now(), **limits))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             expected = "another name, or that key revoked first"
             raise InputError("there is a key of this name", path="name", got=name, expected=expected)

@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from specshield.errors import FormulaError, InputError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.card import policy_id
 from specshield.policy.methods import METHODS, load_policy
@@ -83,8 +85,7 @@ class Policies(Claimed):
         stored = self._kept.find(key, "policy.json") if files.HASH.fullmatch(key) else None
         if stored is None:
             return None
-        card = self._kept.find(key, "card.json")
-        return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
+        return replace(msgspec.convert(stored, Record), card=self._kept.find(key, "card.json"))
 
     def find(self, key: str, owner: str) -> Record:
         """A policy that this owner may use, by its id or its name. Raises NotFound."""
