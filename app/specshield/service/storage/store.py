@@ -128,7 +128,7 @@ class Store:
         has to be unique, so that a second try recognizes the session that a first one created.
         """
         await self.list_name(id, *limits)
-        begun = await self._write(id, b"", change, config)
+        begun = await self._write(id, b"", change._replace(config=config))
         if isinstance(begun, Record) and begun.config == config:  # by an earlier try whose answer was lost
             begun = begun.version
         if not isinstance(begun, bytes):
@@ -159,21 +159,21 @@ class Store:
         any more, writes nothing and returns the session with the record of step `change.t`, None if it is
         gone.
         """
-        return await self._write(id, version, change, change.config)
+        return await self._write(id, version, change)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session with the record of step t; None if there is no session. One round trip."""
-        found = await self._write(id, NO_VERSION, Change(b"", t=t), b"")
+        found = await self._write(id, NO_VERSION, Change(b"", t=t))
         assert not isinstance(found, bytes)
         return found
 
-    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
+    async def _write(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
         """A command that is lost on the way is sent again. An append that arrives twice is made once: the
         second one finds another version.
         """
         field = "" if change.t is None else change.t
-        args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
-        args += (self._ttl * 1000, int(self._replicas > 0))
+        args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state]
+        args += (change.config, self._ttl * 1000, int(self._replicas > 0))
         with reaching():
             written = await self._wire.run(APPEND, keys(id), args)
         if isinstance(written, bytes):
