@@ -284,7 +284,7 @@ def begin(
         spec_status=status,
         expires_at=0.0,
         head=record.digest(rules.line(rule)),
-        carry=handover.begun(way),
+        carry=handover.begun(rule.found),
         any_signal=any_signal(shield, rows[:, :3]),
     )
     return rule, state, rows
