@@ -40,40 +40,32 @@ REASONS = ("infeasible", "zero_prior_mass", "margin_unattainable")
 
 
 class Family(NamedTuple):
-    """A counter, or with `bounds` a histogram; with `label` one for each of its `values`.
+    """A counter, or with `bounds` a histogram; with `label` one for each value of it.
 
-    first: its first cell. A counter has one cell. A histogram has one for each bucket, of which the last has
-    no upper bound, and one for the sum.
+    firsts: the first cell for each value. A counter has one cell. A histogram has one for each bucket, of
+    which the last has no upper bound, and one for the sum.
     """
 
     name: str
     help: str
-    first: int
     label: str | None
-    values: tuple[str, ...]
     bounds: tuple[float, ...]
-
-    @property
-    def width(self) -> int:
-        return len(self.bounds) + 2 if self.bounds else 1
-
-    def cell(self, value: str = "") -> int:
-        return self.first + self.width * (self.values.index(value) if self.label else 0)
+    firsts: Mapping[str, int]
 
     def metric(self, cells: Floats) -> Metric:
-        labels = [self.label] if self.label else []
-        kind = HistogramMetricFamily if self.bounds else CounterMetricFamily
-        family: Metric = kind(self.name, self.help, labels=labels)
-        for value in self.values:
-            held = cells[self.cell(value) : self.cell(value) + self.width]
-            given = [value] if self.label else []
-            if isinstance(family, HistogramMetricFamily):
-                names = [*map(str, self.bounds), "+Inf"]
-                below = held[:-1].cumsum().tolist()
-                family.add_metric(given, list(zip(names, below, strict=True)), float(held[-1]))
-            elif isinstance(family, CounterMetricFamily):
-                family.add_metric(given, float(held[0]))
-        return family
+        labels = [] if self.label is None else [self.label]
+        if not self.bounds:
+            counter = CounterMetricFamily(self.name, self.help, labels=labels)
+            for value, first in self.firsts.items():
+                counter.add_metric([value], float(cells[first]))
+            return counter
+        histogram = HistogramMetricFamily(self.name, self.help, labels=labels)
+        names = [*map(str, self.bounds), "+Inf"]
+        for value, first in self.firsts.items():
+            total = first + len(names)
+            below = cells[first:total].cumsum().tolist()
+            histogram.add_metric([value], list(zip(names, below, strict=True)), float(cells[total]))
+        return histogram
 
 
 class Cells:
@@ -95,12 +87,14 @@ class Cells:
         label: str | None = None,
         values: tuple[str, ...] = ("",),
         bounds: tuple[float, ...] = (),
-    ) -> Family:
-        made = Family(name, help, self._used, label, values, bounds)
-        self._used += made.width * len(values)
+    ) -> dict[str, int]:
+        """Makes a family, and returns its `firsts`."""
+        width = len(bounds) + 2 if bounds else 1
+        firsts = {value: self._used + i * width for i, value in enumerate(values)}
+        self._used += width * len(values)
         assert self._used <= SIZE
-        self._families.append(made)
-        return made
+        self._families.append(Family(name, help, label, bounds, firsts))
+        return firsts
 
     def observe(self, first: int, bounds: tuple[float, ...], value: float) -> None:
         """Adds `value` to the histogram that begins at this cell."""
@@ -143,30 +137,27 @@ _refusal = {error.type: refusals.labels(error.type) for error in tree()}
 
 cells = Cells()
 _held, _observe = cells.held, cells.observe
-decisions = cells.family("specshield_decisions", "Steps decided, without replays.", "mode", MODES)
-reasons = cells.family("specshield_reasons", "Decisions that carry a reason.", "reason", REASONS)
-uncertified = cells.family(
+_modes = cells.family("specshield_decisions", "Steps decided, without replays.", "mode", MODES)
+_reasons = cells.family("specshield_reasons", "Decisions that carry a reason.", "reason", REASONS)
+_uncertified = cells.family(
     "specshield_decisions_without_witness", "Decisions on a pending rule that certify no way to keep it."
-)
-replays = cells.family("specshield_replays", "Steps answered again from the store.")
-passed_over = cells.family(
+)[""]
+_replays = cells.family("specshield_replays", "Steps answered again from the store.")[""]
+_passed_over = cells.family(
     "specshield_steps_passed_over", "Poses told later, of steps that a robot took without a decision."
-)
-part_seconds = cells.family(
+)[""]
+_rollout, _store = cells.family(
     "specshield_step_part_seconds", "Time of a step by part.", "part", ("rollout", "store"), SECONDS
-)
-mass_ratio = cells.family(
+).values()
+_mass_ratio = cells.family(
     "specshield_feasible_mass_ratio", "Probability that the model gave to feasible actions.", bounds=MASS
-)
-residual_meters = cells.family(
+)[""]
+_residual_meters = cells.family(
     "specshield_residual_meters", "From a pose to the nearest one foreseen.", bounds=RESIDUAL
-)
-residual_radians = cells.family(
+)[""]
+_residual_radians = cells.family(
     "specshield_residual_radians", "From a heading to that of the nearest pose foreseen.", bounds=RESIDUAL
-)
-_MODE = {mode: decisions.cell(mode) for mode in MODES}
-_REASON = {reason: reasons.cell(reason) for reason in REASONS}
-_ROLLOUT, _STORE = part_seconds.cell("rollout"), part_seconds.cell("store")
+)[""]
 
 
 @lru_cache(maxsize=1024)
@@ -188,7 +179,7 @@ def refused(type: str) -> None:
 
 def replayed() -> None:
     """Counts a step that was answered from the store."""
-    _held[replays.first] += 1.0
+    _held[_replays] += 1.0
 
 
 def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) -> None:
@@ -197,20 +188,20 @@ def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) ->
     told_later: how many poses before x_t came with it. timing: the seconds of `rollout` and `store`.
     """
     mass, residual = decision.feasible_mass, decision.residual
-    _held[_MODE[decision.mode]] += 1.0
+    _held[_modes[decision.mode]] += 1.0
     if decision.reason is not None:
-        _held[_REASON[decision.reason]] += 1.0
+        _held[_reasons[decision.reason]] += 1.0
     if decision.witness is None and decision.mode != "prior":
-        _held[uncertified.first] += 1.0
+        _held[_uncertified] += 1.0
     if told_later > 0:
-        _held[passed_over.first] += told_later
+        _held[_passed_over] += told_later
     if mass is not None:
-        _observe(mass_ratio.first, MASS, mass)
+        _observe(_mass_ratio, MASS, mass)
     if residual is not None:
-        _observe(residual_meters.first, RESIDUAL, residual[0])
-        _observe(residual_radians.first, RESIDUAL, residual[1])
-    _observe(_ROLLOUT, SECONDS, timing["rollout"])
-    _observe(_STORE, SECONDS, timing["store"])
+        _observe(_residual_meters, RESIDUAL, residual[0])
+        _observe(_residual_radians, RESIDUAL, residual[1])
+    _observe(_rollout, SECONDS, timing["rollout"])
+    _observe(_store, SECONDS, timing["store"])
     if decision.finished:
         logs.tell("session finished", spec_status=decision.spec_status, t=decision.t)
     if logs.log.isEnabledFor(logging.DEBUG):
