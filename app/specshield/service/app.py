@@ -150,9 +150,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await until_it_may_listen(startup, tasks[0])
         yield
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        while left := [task for task in tasks if not task.done()]:
+            for task in left:  # again and again, since redis-py may swallow a cancellation
+                task.cancel()
+            await asyncio.wait(left, timeout=0.1)
         if worker is not None:
             await asyncio.to_thread(worker.stop)
         heavy.close()
