@@ -21,6 +21,7 @@ import redis
 
 from specshield.errors import SessionExists, StoreError
 from specshield.service.sessions.mover import Mover
+from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archive import Archive, Entry
 from specshield.service.storage.archiving import ArchivingStore
@@ -444,6 +445,19 @@ def test_links_and_copies_among_the_files_keep_no_sweep_from_its_end(url, tmp_pa
         assert await store.dump("ann@robot") == dump
         for name, told in zip(["ann@/up", "loop"], caplog.messages, strict=True):
             assert str(tmp_path / name) in told
+
+    run(url, archive, story)
+
+
+def test_a_session_that_another_version_stored_otherwise_keeps_no_other_from_moving(url, archive):
+    async def story(store):
+        await begin(store, "@another", 1)
+        state = State(1, 1, True, "satisfied", time.time() + TTL, b"", finished=True)
+        await store.create("@ended", b"config", Change(state.packed(), ROW))
+        mover = Mover(store, Settings())
+        mover._ended = -1.0  # whatever has ended is due
+        assert await mover.move() == 1
+        assert (await in_store(store, "@another"), await in_store(store, "@ended")) == (True, False)
 
     run(url, archive, story)
 

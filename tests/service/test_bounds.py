@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import socket
@@ -17,6 +18,8 @@ import httpx
 import psutil
 import pytest
 
+from specshield.errors import StoreError
+from specshield.service.bounds.bodies import IN_MEMORY, Body, Budget
 from tests.service.world import grid_json
 from tests.serving import HUNG, RunningServer, serving, wait_for
 
@@ -197,6 +200,13 @@ def test_a_client_that_goes_away_in_an_upload_is_no_failure(server: Any, client:
     wait_for(gone)
     assert server.log.read_text().count("Traceback") == before
     assert list((server.data_dir / "incoming").glob("*")) == []
+
+
+def test_a_large_upload_that_the_disk_does_not_take_is_refused_and_no_failure(tmp_path: Path) -> None:
+    (tmp_path / "incoming").touch()  # where its folder would be
+    body = Body(Budget(2 * IN_MEMORY), tmp_path / "incoming", "")
+    with pytest.raises(StoreError):
+        asyncio.run(body.add(bytes(IN_MEMORY + 1)))
 
 
 def test_thousands_of_unknown_fields_are_refused_with_one_error(client: httpx.Client) -> None:

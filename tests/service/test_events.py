@@ -15,7 +15,6 @@ from typing import Any
 import httpx
 import redis
 
-from specshield.service.access.owners import scoped
 from specshield.service.sessions import record
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State
@@ -23,6 +22,7 @@ from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
+from specshield.service.storage.store import scoped
 from specshield.service.watch.events import Watchers
 from tests.service.world import ahead
 from tests.serving import HUNG, serving, wait_for
@@ -177,6 +177,18 @@ def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_i
         reader.join(HUNG)
         assert not reader.is_alive()
         assert [t for t, _ in reader.found] == [0, 1, 2]
+
+
+def test_a_server_that_is_stopped_by_ctrl_c_lets_its_readers_go(tmp_path):
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+        body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+        reader = Reader(server.url, client.post("/v1/sessions", json=body).json()["id"])
+        wait_for(lambda: watched(client))
+        server.process.send_signal(signal.SIGINT)
+        assert server.process.wait(HUNG) == 0
+        reader.join(HUNG)
+        assert not reader.is_alive()
+        assert "timeout graceful shutdown exceeded" not in server.log.read_text()
 
 
 @contextlib.asynccontextmanager

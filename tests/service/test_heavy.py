@@ -13,8 +13,7 @@ import pytest
 
 from specshield.errors import Busy, MapError, ServerError, StoreError, TooExpensive
 from specshield.service.heavy.child import LENGTH
-from specshield.service.heavy.pool import Pool, Template
-from specshield.service.heavy.queue import Turns
+from specshield.service.heavy.pool import Pool, Template, Turns
 from tests.serving import children, wait_for
 
 

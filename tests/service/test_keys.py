@@ -12,8 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
-from specshield.service.access.keys import MISS_EVERY, OPEN, REFRESH, Key, Keys
-from specshield.service.access.rates import Rates
+from specshield.service.access.keys import KEYS, MISS_EVERY, OPEN, REFRESH, Key, Keys, Rates
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
 from tests.service.test_bad_input import problem
@@ -334,6 +333,20 @@ def test_a_key_is_revoked_in_a_store_whose_memory_is_full(keyed):
             await keys.revoke("full")
 
     on_keys(keyed, act)
+
+
+def test_a_key_that_a_newer_version_made_is_read_by_this_one(keyed):
+    """Its record may say more. While one version replaces the other, both know all keys."""
+
+    async def made(keys):
+        await keys.create("newer", sessions=7)
+        record = json.loads(await keys._store.hget(KEYS, "newer"))
+        await keys._store.hset(KEYS, "newer", json.dumps({**record, "more": 1}))
+        found = [key.sessions for key in await keys.listed() if key.name == "newer"]
+        await keys.revoke("newer")
+        return found
+
+    assert on_keys(keyed, made) == [7]
 
 
 def test_unknown_keys_do_not_ask_the_store_each():

@@ -2,7 +2,6 @@
 
 import asyncio
 import gc
-import json
 from operator import attrgetter
 
 import httpx
@@ -13,6 +12,7 @@ import pytest
 from specshield.caution.taught import Taught
 from specshield.service.app import create_app
 from specshield.service.library.files import Recent
+from specshield.service.sessions.rules import line
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
@@ -20,7 +20,7 @@ from specshield.service.storage.store import Record
 from specshield.shield.decision import Carry
 from specshield.task import Task
 from specshield.world.learned import LearnedMap
-from tests.service.world import LOGITS, START, grid_json, policy_files
+from tests.service.world import LOGITS, START, grid_json, policy_files, rule
 
 ROUNDS = 8
 
@@ -28,8 +28,8 @@ ROUNDS = 8
 def session(formula="F[0,6] Goal", motions=4, horizon=8):
     carry = Carry(0, np.zeros((motions, 3)), (bytes(horizon),) * motions)
     state = State(1, 1, True, "pending", 0.0, b"", carry=carry)
-    config = {"spec": {"formula": formula, "regions": {}, "signals": {}}, "seed": 0}
-    return Session.of(Record(json.dumps(config).encode(), state.packed(), b"1", bytes(24), None))
+    told = rule(spec={"formula": formula, "regions": {}, "signals": {}})
+    return Session.of(Record(line(told), state.packed(), b"1", bytes(24), None))
 
 
 def test_the_sessions_used_last_are_kept():

@@ -27,6 +27,7 @@ from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, NEARLY, READY, Startup
 from specshield.shield.decision import Config
+from tests.service.world import rule
 from tests.serving import children, command_line, runs, serving, wait_for
 
 
@@ -181,13 +182,12 @@ def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete
 
 def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_compiled(tmp_path):
     startup = Startup(completing=True)
-    shields = Shields(policies_of(Settings(data_dir=tmp_path)), 10, startup.has)
+    shields = Shields(policies_of(Settings(data_dir=tmp_path)), startup.has)
     learned, computed = (shields.policies.find(name, "").id for name in ("case1-dqn", "case1"))
     assert shields.slow_policies([learned])
     assert not shields.slow_policies([computed])
-    config = {"shaping": "projection", "policy_ids": [computed]}
-    state = State(0, 0, True, "pending", 0.0, b"")
-    session = Session([config], Config(threshold_over="episode"), state, b"", np.empty((0, 3)), [], 0, 0)
+    settings, state = Config(threshold_over="episode"), State(0, 0, True, "pending", 0.0, b"")
+    session = Session([rule(policy_ids=[computed])], settings, state, b"", np.empty((0, 3)), [], 0, 0)
     assert shields.slow(session)
     startup.completing = False  # as where it cannot be compiled
     assert not shields.slow(session)

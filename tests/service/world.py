@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 import httpx
+import msgspec
 import numpy as np
 from safetensors.numpy import save
 
@@ -14,6 +15,7 @@ from specshield.policy.dqn.observation import observation_size
 from specshield.policy.progress import make_rules
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body, motion_count
+from specshield.service.sessions.rules import Rule
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -86,3 +88,13 @@ def ahead(n: int) -> list[list[float]]:
         x += 0.2
         poses.append([x, 1.5, 0.0])
     return poses
+
+
+def rule(**members: Any) -> Rule:
+    """A session's stored rule, in which these members matter."""
+    usual = Rule(
+        id="a", policy_ids=[], map_id="m", spec={"formula": "F[0,6] Goal", "regions": {}, "signals": {}},
+        robot="stretch", horizon=6, actions=[], terminal_actions=[], seed=0, threshold=1.0, margin=0.0,
+        evaluation="feasibility", max_steps=600, shaping="projection",
+    )  # fmt: skip
+    return msgspec.structs.replace(usual, **members)

@@ -82,9 +82,9 @@ def of_record(
         items.append(TrajectoryItem(t, pose, dict(zip(names, held[3:], strict=True)), json.loads(told)))
     return Recording(
         config.id,
-        config.spec.formula,
+        config.spec["formula"],
         config.actions,
-        {**rooms, **parse_regions(config.spec.regions)},
+        {**rooms, **parse_regions(config.spec["regions"])},
         items,
         grid,
         robot_from_json(config.robot),

@@ -16,19 +16,17 @@ from starlette.types import Receive, Scope, Send
 from specshield import __version__
 from specshield.service import pages, problems
 from specshield.service.access.keys import Keys
-from specshield.service.bounds import body
-from specshield.service.bounds.bodies import Bodies
+from specshield.service.bounds import bodies
 from specshield.service.bounds.protocol import raise_file_limit
 from specshield.service.description import TAGS, described
 from specshield.service.heavy.heavy import Heavy
-from specshield.service.leaving import drain_at_sigterm
+from specshield.service.leaving import heed_signals
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe
 from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
-from specshield.service.routes.steps import StepRoute
-from specshield.service.routes.stream import StreamRoute
+from specshield.service.routes.steps import StepRoutes
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
@@ -65,9 +63,9 @@ class Application:
 
     def __init__(self, routes: FastAPI, settings: Settings) -> None:
         self.routes = routes
-        steps = StepRoute(StreamRoute(routes))
+        steps = StepRoutes(routes)
         # The guard comes before the bodies: nothing is read of a request that it refuses.
-        self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
+        self._around = Observe(Guard(bodies.Bodies(steps, settings), settings.hosts))
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = self.routes
@@ -136,10 +134,9 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     server = Server(
         settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys
     )
-    body.clear(settings.data_dir / "incoming")
+    bodies.clear(settings.data_dir / "incoming")
     app.state.server = server
-    server.streams.close_at_stop()  # before the next line, whose handler calls this one after the drain
-    drain_at_sigterm(startup, settings.drain)
+    heed_signals(startup, server.streams, settings.drain)
     running = (
         prepare(startup, check),
         *([complete(startup)] if settings.complete else []),
@@ -153,10 +150,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await until_it_may_listen(startup, tasks[0])
         yield
     finally:
-        for task in tasks:
-            task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.gather(*tasks)
+        while left := [task for task in tasks if not task.done()]:
+            for task in left:  # again and again, since redis-py may swallow a cancellation
+                task.cancel()
+            await asyncio.wait(left, timeout=0.1)
         if worker is not None:
             await asyncio.to_thread(worker.stop)
         heavy.close()

@@ -10,7 +10,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client.multiprocess import mark_process_dead
@@ -34,34 +33,35 @@ class Streams:
         for stop in list(self.open):
             stop()
 
-    def close_at_stop(self) -> None:
-        """Closes the streams when the server is told to stop. To be called in the server's event loop."""
-        loop = asyncio.get_running_loop()
 
-        def told(stop: Callable[[], object]) -> None:
-            loop.call_soon_threadsafe(self.close)
-            stop()
+def heed_signals(startup: Startup, streams: Streams, drain: float) -> None:
+    """After SIGTERM, /readyz answers 503 and everything else goes on; `drain` seconds later the streams are
+    closed and the server stops. SIGINT, or a SIGTERM more than ECHO later, stops it at once.
 
-        _tell(told, signal.SIGTERM, signal.SIGINT)
-
-
-def drain_at_sigterm(startup: Startup, seconds: float) -> None:
-    """After SIGTERM, /readyz answers 503 and everything else goes on; `seconds` later the server stops.
-
-    SIGINT, or a SIGTERM more than ECHO later, stops it at once. To be called in the server's event loop.
+    To be called in the server's event loop, where uvicorn's handlers are set. Does nothing outside the main
+    thread: there the server is part of another program.
     """
+    if threading.current_thread() is not threading.main_thread():
+        return
     loop, first = asyncio.get_running_loop(), math.inf
+    uvicorns = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    def told(stop: Callable[[], object]) -> None:
+    def stop(number: int, frame: Any) -> None:
+        loop.call_soon_threadsafe(streams.close)
+        if callable(before := uvicorns[signal.Signals(number)]):
+            before(number, frame)
+
+    def told(number: int, frame: Any) -> None:
         nonlocal first
         again, startup.stopping = startup.stopping, True
-        if seconds <= 0 or time.monotonic() - first > ECHO:
-            stop()
+        if drain <= 0 or number == signal.SIGINT or time.monotonic() - first > ECHO:
+            stop(number, frame)
         elif not again:
             first = time.monotonic()
-            loop.call_soon_threadsafe(loop.call_later, seconds, stop)
+            loop.call_soon_threadsafe(loop.call_later, drain, stop, number, frame)
 
-    _tell(told, signal.SIGTERM)
+    for number in uvicorns:
+        signal.signal(number, told)
 
 
 def notice_killed() -> None:
@@ -83,17 +83,3 @@ def notice_killed() -> None:
 
     Process.start = start_and_close  # type: ignore[assignment, method-assign]
     Process.join = join_and_forget  # type: ignore[assignment, method-assign]
-
-
-def _tell(told: Callable[[Callable[[], object]], None], *numbers: signal.Signals) -> None:
-    """Has `told` called for these signals, with the former handler; uvicorn restores its caller's handlers at
-    the end. Does nothing outside the main thread: there the server is part of another program.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return
-    for number in numbers:
-        signal.signal(number, partial(_handle, told, signal.getsignal(number)))
-
-
-def _handle(told: Callable[[Callable[[], object]], None], before: Any, number: int, frame: Any) -> None:
-    told(partial(before, number, frame) if callable(before) else lambda: None)

@@ -14,9 +14,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specshield.errors import NotFound, SpecshieldError, Stopping
 from specshield.service import metrics, problems
-from specshield.service.access.rates import Rates
+from specshield.service.access.keys import Rates
 from specshield.service.access.site import check_site
-from specshield.service.routes.stream import PATH
+from specshield.service.routes.steps import STREAM
 from specshield.service.watch import logs
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -95,7 +95,7 @@ class Guard:
         check_site(scope, headers, self._allowed)
         path, server = scope["path"], scope["app"].state.server
         # A newline at the end has to be refused here: `$` in a route's pattern would match before it.
-        if path.endswith("\n") or (scope["type"] == "websocket" and PATH.fullmatch(path) is None):
+        if path.endswith("\n") or (scope["type"] == "websocket" and STREAM.fullmatch(path) is None):
             raise NotFound(f"there is no {path!r} here", got=path, expected="a path listed at /docs")
         if guarded(path):
             key = await server.keys.check(headers.get(b"authorization", b""))

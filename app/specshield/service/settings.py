@@ -6,7 +6,7 @@ import os
 import re
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import AliasChoices, Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -17,8 +17,10 @@ from specshield.service.access.site import AUTHORITY
 from specshield.service.storage.connect import FAILURES, FORMS, connect, is_cluster
 from specshield.service.storage.embedded import EmbeddedStore
 
-LONGEST = 24 * 3600  # [s], the most for times to wait: timers do not take every number
 ALIKE = 0.9  # difflib's ratio for a misspelt name; Kubernetes' SPECSHIELD_PORT, _SERVICE_HOST... have less
+Count = Annotated[int, Field(ge=1)]
+AnyCount = Annotated[int, Field(ge=0)]
+Seconds = Annotated[float, Field(gt=0, le=24 * 3600)]  # timers do not take every number
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
@@ -29,141 +31,68 @@ class Settings(BaseSettings):
         env_prefix="SPECSHIELD_", frozen=True, extra="ignore", env_ignore_empty=True
     )
 
-    data_dir: Path = Field(Path("data"), description="Uploaded maps, trained policies, the embedded store.")
-    data_url: str | None = Field(
-        None,
-        description="Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the "
-        "same for all servers and workers of one store. By default, the data folder.",
-    )
-    models_dir: Path = Field(shipped.MODELS, description="Policies that every key may use, one folder each.")
-    maps_dir: Path = Field(shipped.MAPS, description="Maps that every key may use, <name>.yaml with image.")
+    data_dir: Path = Path("data")  # uploaded maps, trained policies, the embedded store
+    # Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the same for all
+    # servers and workers of one store. By default, the data folder.
+    data_url: str | None = None
+    models_dir: Path = shipped.MODELS  # policies that every key may use, one folder each
+    maps_dir: Path = shipped.MAPS  # maps that every key may use, <name>.yaml with image
+    # The store (storage/connect.py has the forms). By default the server starts its own.
     redis_url: str | None = Field(
-        None,
-        validation_alias=AliasChoices("redis_url", "REDIS_URL", "SPECSHIELD_REDIS_URL"),
-        description="The store (storage/connect.py has the forms). By default the server starts its own.",
+        None, validation_alias=AliasChoices("redis_url", "REDIS_URL", "SPECSHIELD_REDIS_URL")
     )
-    store_timeout: float = Field(2.0, gt=0, le=LONGEST, description="Longest wait for the store [s].")
-    store_replicas: int = Field(
-        0,
-        ge=0,
-        le=8,
-        description="How many replicas of the store at REDIS_URL need to have a step before it is answered.",
-    )
-    api_key: SecretStr | None = Field(
-        None, description="A key, for `Authorization: Bearer <key>`, beside those of `specshield keys`."
-    )
-    ask_for_key: bool = Field(
-        False,
-        description="Whether a server refuses everybody, rather than nobody, while its store has no key. "
-        "`serve` sets it where other machines reach the server.",
-    )
-    allowed_hosts: str = Field(
-        "",
-        description="Further names, with or without a port, that a request's Host may have, such as that of "
-        "a proxy. Separated by commas.",
-    )
+    store_timeout: Seconds = 2.0  # longest wait for the store
+    # How many replicas of the store at REDIS_URL need to have a step before it is answered.
+    store_replicas: int = Field(0, ge=0, le=8)
+    api_key: SecretStr | None = None  # for `Authorization: Bearer <key>`, beside those of `specshield keys`
+    # Whether a server refuses everybody, rather than nobody, while its store has no key. `serve` sets it
+    # where other machines reach the server.
+    ask_for_key: bool = False
+    # Further names, with or without a port, that a request's Host may have, such as that of a proxy.
+    # Separated by commas.
+    allowed_hosts: str = ""
 
-    max_horizon: int = Field(1000, ge=1, description="Longest horizon of a formula [steps].")
-    max_steps: int = Field(10_000, ge=1, description="Most steps that a session may ask for.")
-    max_body_bytes: int = Field(1 << 20, ge=1024, description="Largest request body [bytes].")
-    max_upload_bytes: int = Field(64 << 20, ge=1024, description="Largest map or policy sent [bytes].")
-    max_bodies_bytes: int = Field(
-        128 << 20, ge=1 << 20, description="Most for all bodies that are being received, together [bytes]."
-    )
-    max_body_members: int = Field(
-        10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
-    )
-    max_spec_bytes: int = Field(
-        256 << 10,
-        ge=1024,
-        description="Largest spec of a policy, and largest outlines of a map's rooms, as JSON [bytes].",
-    )
-    max_header_bytes: int = Field(32 << 10, ge=1024, description="Largest head of a request [bytes].")
-    max_connections: int = Field(2000, ge=8, description="Most connections at once to one server process.")
-    request_timeout: float = Field(
-        15.0,
-        gt=0,
-        le=LONGEST,
-        description="Longest time for a request's head or body to arrive, and for an unread answer [s].",
-    )
-    min_body_rate: int = Field(
-        64 << 10, ge=1, description="For each so many bytes, a body may take 1 s more [bytes]."
-    )
-    keep_alive_timeout: float = Field(
-        30.0, gt=0, le=LONGEST, description="A connection without a request is closed after this long [s]."
-    )
-    heavy_timeout: float = Field(
-        20.0, gt=0, le=LONGEST, description="Longest that reading an upload or drawing a map may take [s]."
-    )
-    heavy_memory: int = Field(
-        1 << 30,
-        ge=256 << 20,
-        description="Most memory of a process that reads an upload or draws a map [bytes].",
-    )
+    max_horizon: Count = 1000  # longest horizon of a formula [steps]
+    max_steps: Count = 10_000  # most steps that a session may ask for
+    max_body_bytes: int = Field(1 << 20, ge=1024)  # largest request body
+    max_upload_bytes: int = Field(64 << 20, ge=1024)  # largest map or policy sent
+    max_bodies_bytes: int = Field(128 << 20, ge=1 << 20)  # most for all bodies that are being received
+    # Largest spec of a policy, and largest outlines of a map's rooms, as JSON.
+    max_spec_bytes: int = Field(256 << 10, ge=1024)
+    max_header_bytes: int = Field(32 << 10, ge=1024)  # largest head of a request
+    max_connections: int = Field(2000, ge=8)  # most connections at once to one server process
+    request_timeout: Seconds = 15.0  # longest for a head or body to arrive, and for an unread answer
+    min_body_rate: Count = 64 << 10  # for each so many bytes, a body may take 1 s more
+    keep_alive_timeout: Seconds = 30.0  # a connection without a request is closed after this long
+    heavy_timeout: Seconds = 20.0  # longest that reading an upload or drawing a map may take
+    # Most memory of a process that reads an upload or draws a map [bytes].
+    heavy_memory: int = Field(1 << 30, ge=256 << 20)
 
-    max_owner_bytes: int = Field(
-        8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."
-    )
-    max_stored_bytes: int = Field(
-        32 << 30, ge=0, description="Most that all maps and policies take on the disk [bytes]."
-    )
-    disk_reserve_bytes: int = Field(
-        64 << 20,
-        ge=0,
-        description="Free space of the data folder's disk that only running sessions use up [bytes].",
-    )
-    max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
-    max_policies: int = Field(1000, ge=1, description="Most policies kept.")
-    max_sessions: int = Field(
-        100_000, ge=1, description="Most sessions in the store; those in the archive do not count."
-    )
-    session_ttl: int = Field(
-        7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
-    )
-    archive_after: int = Field(
-        3600,
-        ge=1,
-        description="A session that has not changed for so long moves to the archive [s]; an ended one does "
-        "after 60 s if this is longer.",
-    )
-    archive_bytes: int = Field(
-        100 << 30,
-        ge=1 << 20,
-        description="Once the archive has so many bytes, no session moves there and none is begun [bytes].",
-    )
-    max_owner_archive_bytes: int = Field(
-        50 << 30,
-        ge=1,
-        description="Once one key's sessions take so many bytes of the archive, it can begin none [bytes].",
-    )
-    drain: float = Field(
-        0.0,
-        ge=0,
-        le=3600,
-        description="How long a server that was told to stop goes on answering, except at /readyz [s].",
-    )
-    shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
+    max_owner_bytes: AnyCount = 8 << 30  # most that one key's maps and policies take on the disk
+    max_stored_bytes: AnyCount = 32 << 30  # most that all maps and policies take on the disk
+    disk_reserve_bytes: AnyCount = 64 << 20  # of the data folder's disk, which only running sessions use up
+    max_maps: Count = 1000  # most uploaded maps kept
+    max_policies: Count = 1000  # most policies kept
+    max_sessions: Count = 100_000  # most sessions in the store; those in the archive do not count
+    session_ttl: Count = 7 * 24 * 3600  # a session is erased this long after its last change [s]
+    # A session that has not changed for so long moves to the archive [s]; an ended one does after 60 s if
+    # this is longer.
+    archive_after: Count = 3600
+    # Once the archive has so many bytes, no session moves there and none is begun.
+    archive_bytes: int = Field(100 << 30, ge=1 << 20)
+    # Once one key's sessions take so many bytes of the archive, it can begin none.
+    max_owner_archive_bytes: Count = 50 << 30
+    # How long a server that was told to stop goes on answering, except at /readyz [s].
+    drain: float = Field(0.0, ge=0, le=3600)
 
-    max_watchers: int = Field(1000, ge=0, description="Most open streams of events, for each server process.")
-    log_format: Literal["text", "json"] = Field(
-        "text", description="Lines of the log, for people or for programs."
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="The lowest level that is logged; `debug` logs each decision."
-    )
+    max_watchers: AnyCount = 1000  # most open streams of events, for each server process
+    log_format: Literal["text", "json"] = "text"  # lines of the log, for people or for programs
+    log_level: Literal["debug", "info", "warning", "error"] = "info"  # the lowest; `debug` logs each decision
 
-    worker: bool | None = Field(
-        None, description="Whether to start a training worker. By default, if the store is embedded."
-    )
-    complete: bool = Field(
-        True, description="Whether to compile, once ready, the kernels that only some sessions need."
-    )
-    training_timeout: int = Field(
-        6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
-    )
-    synthesis_timeout: int = Field(
-        600, ge=1, description="Longest run of a method that computes its policies [s]."
-    )
+    worker: bool | None = None  # whether to start a training worker; by default, if the store is embedded
+    complete: bool = True  # whether to compile, once ready, the kernels that only some sessions need
+    training_timeout: Count = 6 * 3600  # longest training run of a method that learns [s]
+    synthesis_timeout: Count = 600  # longest run of a method that computes its policies [s]
 
     @field_validator("models_dir", "maps_dir")
     @classmethod

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from specshield.service.access.keys import Keys
+from specshield.service.access.keys import Key, Keys
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.leaving import Streams
 from specshield.service.library.files import Recent
@@ -52,11 +52,24 @@ class Server:
     streams: Streams = field(default_factory=Streams)
 
 
-def _server(request: Request) -> Server:
+async def _server(request: Request) -> Server:
     server: Server = request.app.state.server
     return server
 
 
+async def _caller(request: Request) -> Key:
+    key: Key = request.scope["state"]["key"]
+    return key
+
+
+Caller = Annotated[Key, Depends(_caller)]
+
+
+async def _owner(caller: Caller) -> str:
+    return caller.name
+
+
+Owner = Annotated[str, Depends(_owner)]
 ServerState = Annotated[Server, Depends(_server)]
 Cursor = Annotated[
     str | None,

@@ -20,10 +20,9 @@ from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import chain, history, record
-from specshield.service.sessions.chain import Chain, Config
-from specshield.service.sessions.config import asked_by, settings_of
+from specshield.service.sessions.chain import Chain
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.rules import carried_over, way
+from specshield.service.sessions.rules import Rule, asked_by, carried_over
 from specshield.service.sessions.session import decide
 from specshield.service.settings import Settings
 from specshield.shield.decision import Carry, Shield, make_shield
@@ -49,7 +48,7 @@ def verify(file: Path, settings: Settings) -> int:
     print(f"session {found.configs[0].id}: {decided} decided steps, {len(found.rows)} poses")
     for config in found.configs:
         if len(found.configs) > 1:
-            print(f"from step {config.begins}, windows from step {config.origin}: {config.spec.formula}")
+            print(f"from step {config.begins}, windows from step {config.origin}: {config.spec['formula']}")
         print(f"map {config.map_id}")
         print(f"policies {', '.join(config.policy_ids)}")
         print(f"decided by specshield {config.version or 'of a version that the record does not name'}")
@@ -97,8 +96,8 @@ def _decide(found: Chain, shields: Sequence[Shield]) -> int:
 
 def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, list[str]]]:
     """The steps whose decision differs now, each with the fields that differ. shields: one for each rule."""
-    configs, rule = [msgspec.to_builtins(config) for config in found.configs], 0
-    carry = begun(way(configs[0]))
+    configs, rule = found.configs, 0
+    carry = begun(configs[0].found)
     maps, made = dict[bytes, LearnedMap](), dict[tuple[int, bytes], Made]()
     for t, content, kept in found.decided():
         while rule < found.rule_at(t):
@@ -153,18 +152,18 @@ def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[
         return [shield for shield, _ in made], [wrong for _, wrong in made]
 
 
-def _shield(config: Config, pose: list[float], policies: Policies) -> tuple[Shield, list[str]]:
+def _shield(config: Rule, pose: list[float], policies: Policies) -> tuple[Shield, list[str]]:
     """The shield of a rule, with `_unlike` of its config. pose: the pose at the rule's origin."""
     records = [policies.record(id) for id in config.policy_ids]
     proposers = [policies.policy(each) for each in records]
-    shield = replace(make_shield(proposers), config=settings_of(msgspec.structs.asdict(config)))
+    shield = replace(make_shield(proposers), config=config.settings)
     wrong = _unlike(config, asked_by(config.policy_ids, records[0].about, shield.task))
     if config.shaping != PROJECTION and not wrong:
         shield = replace(shield, preference=prepare(config.shaping, shield.task, proposers, pose))
     return shield, wrong
 
 
-def _unlike(config: Config, asked: Mapping[str, Any]) -> list[str]:
+def _unlike(config: Rule, asked: Mapping[str, Any]) -> list[str]:
     """The members of a config that differ from those that a server would store for the same policies."""
     said = msgspec.to_builtins(config)
     said, asked = {**said, **said["spec"]}, {**asked, **asked["spec"]}

@@ -10,17 +10,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
-import json
 import logging
 import math
 import re
 import secrets
 import time
 from collections.abc import Awaitable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
+import msgspec
+
+from specshield.errors import InputError, LimitReached, NotFound, RateLimited, StoreError, Unauthorized
 from specshield.service.library.files import now
 from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.storage.connect import reaching
@@ -127,14 +128,18 @@ class Keys:
     async def follow(self) -> None:
         """Refreshes the keys until it is cancelled."""
         while True:
-            await self.refresh()
+            try:
+                await self.refresh()
+            except Exception:  # the next one may succeed; without them no revoked key would be refused
+                log.exception("the keys cannot be read")
             await asyncio.sleep(REFRESH)
 
     # --- for the command line
 
     async def listed(self) -> list[Key]:
         found = await _reached(self._store.hgetall(KEYS))
-        return sorted((Key(**json.loads(v)) for k, v in found.items() if k), key=lambda key: key.name)
+        keys = [msgspec.json.decode(record, type=Key) for name, record in found.items() if name]
+        return sorted(keys, key=lambda key: key.name)
 
     async def create(self, name: str, **limits: Any) -> str:
         """Makes a key and returns it: it cannot be read again. Raises InputError and LimitReached."""
@@ -143,7 +148,7 @@ class Keys:
         if await _reached(self._store.hlen(KEYS)) > MOST_KEYS:
             raise LimitReached(f"there are {MOST_KEYS} keys", expected="room for one more: revoke one")
         secret = f"ss_{secrets.token_urlsafe(32)}"
-        record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
+        record = msgspec.json.encode(Key(name, digest_of(secret.encode()), now(), **limits))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             expected = "another name, or that key revoked first"
             raise InputError("there is a key of this name", path="name", got=name, expected=expected)
@@ -154,6 +159,32 @@ class Keys:
         """Revokes a key. What was made with it belongs to the next key of this name. Raises NotFound."""
         if not name or await _reached(self._store.eval(REVOKE, 1, KEYS, name, secrets.token_hex(8))) is None:
             raise NotFound("there is no such key", path="name", got=name, expected="a name in `keys list`")
+
+
+class Rates:
+    """Limits the requests that a key may make in a second. Steps have their own bucket of tokens, so that the
+    robots of a key go on whatever else the key is used for. A bucket is the number of requests that were
+    left, at most those of a second, and when that was [s].
+    """
+
+    def __init__(self) -> None:
+        self._buckets: dict[tuple[str, bool], tuple[float, float]] = {}  # by the key's name, and for steps
+
+    def take(self, key: Key, step: bool) -> None:
+        """Counts a request. Raises RateLimited, with the seconds to wait."""
+        rate = key.requests
+        if rate is None:
+            return
+        now, most = time.monotonic(), max(1.0, rate)
+        left, then = self._buckets.get((key.name, step), (most, now))
+        left = min(most, left + (now - then) * rate)
+        if left < 1.0:
+            raise RateLimited(
+                f"the key {key.name!r} may make {rate:g} requests in a second",
+                expected="the request again after Retry-After",
+                retry_after=math.ceil((1.0 - left) / rate),
+            )
+        self._buckets[key.name, step] = left - 1.0, now
 
 
 OPEN = Key("", "")  # stands for all callers of a server that asks for no key

@@ -1,38 +1,115 @@
 """Receives the body of each request within limits, before the application sees the request.
 
 So no route waits for bytes, a request whose client leaves in the middle of the body has no effect, and large
-bodies are on the disk for the process that parses them.
+bodies are on the disk for the process that parses them. A budget limits all bodies together.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import tempfile
+import time
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from specshield.errors import BodyTooLarge, InputError, RequestTimeout, SpecshieldError
+from specshield.errors import BodyTooLarge, Busy, InputError, RequestTimeout, SpecshieldError
 from specshield.service import problems
 from specshield.service.access.site import UPLOADS
-from specshield.service.bounds.body import FREE, Body, Budget
 from specshield.service.bounds.protocol import ARRIVED
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings
+from specshield.service.storage.objects import unusable
 
 LONG = ("/steps", "/close", "/switch", "/validate")  # bodies with a history, or a formula with regions
+FREE = 64 << 10  # [bytes] of each body that the budget does not count, so that steps are always taken
+IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they are written to its file
 LONG_JSON = 16 << 10  # [bytes]; a shorter body has no room for many members
+MEMBERS = 10_000  # of all objects in a body that is no upload, at most; chosen by hand
+
+
+class Budget:
+    """The bytes that the bodies of all requests together may have."""
+
+    def __init__(self, limit: int) -> None:
+        self._left = limit
+
+    def take(self, size: int) -> None:
+        """Raises Busy if so many bytes are not left."""
+        if size > self._left:
+            raise Busy(
+                "the server cannot hold more bytes of requests now", expected="the request again in a while"
+            )
+        self._left -= size
+
+    def give(self, size: int) -> None:
+        self._left += size
+
+
+@dataclass
+class Body:
+    """folder: for the file of a large body. `close` removes the file and gives the bytes back."""
+
+    budget: Budget
+    folder: Path
+    content_type: str
+    size: int = 0
+    _held: bytearray = field(default_factory=bytearray)
+    _file: Any = None
+
+    async def add(self, chunk: bytes) -> None:
+        """Raises Busy if the bodies of all requests together have too many bytes, and InsufficientStorage or
+        StoreError if the file cannot be written.
+        """
+        counted = max(self.size - FREE, 0)
+        self.budget.take(max(self.size + len(chunk) - FREE, 0) - counted)
+        self.size += len(chunk)
+        self._held += chunk
+        if len(self._held) > IN_MEMORY:
+            await self._write()
+
+    async def end(self) -> None:
+        """To be called after the last `add`."""
+        if self._file is not None:
+            await self._write()
+
+    @property
+    def content(self) -> bytes | Path:
+        """The whole body, or the file that holds it."""
+        return bytes(self._held) if self._file is None else Path(self._file.name)
+
+    async def _write(self) -> None:
+        held, self._held = self._held, bytearray()
+        try:
+            await asyncio.to_thread(self._append, held)
+        except OSError as error:
+            raise unusable(error) from error
+
+    def _append(self, content: bytearray) -> None:
+        if self._file is None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._file = tempfile.NamedTemporaryFile(dir=self.folder)  # noqa: SIM115  it stays open until `close`
+        self._file.write(content)
+        self._file.flush()
+
+    def close(self) -> None:
+        self.budget.give(max(self.size - FREE, 0))
+        self.size = 0
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()  # which removes it
 
 
 class Bodies:
     """Puts the `Body` of an upload into `scope["state"]["body"]`; other routes get theirs in one message."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self.app = app
-        self._folder = settings.data_dir / "incoming"
-        self._budget = Budget(settings.max_bodies_bytes)
-        self._max_body, self._max_upload = settings.max_body_bytes, settings.max_upload_bytes
-        self._members, self._patience = settings.max_body_members, settings.request_timeout
-        self._slowest, self._short = settings.min_body_rate, min(settings.max_body_bytes, LONG_JSON)
+        self.app, self._settings, self._budget = app, settings, Budget(settings.max_bodies_bytes)
+        self._folder, self._short = settings.data_dir / "incoming", min(settings.max_body_bytes, LONG_JSON)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or not _has_body(scope):
@@ -51,7 +128,7 @@ class Bodies:
                     scope["state"]["status"] = CLIENT_GONE
                     return
                 if not upload:
-                    self._check_members(body.content)
+                    _check_members(body.content)
             except SpecshieldError as error:
                 # The rest of the body is not read.
                 await problems.ProblemResponse(error, {"Connection": "close"})(scope, receive, send)
@@ -74,18 +151,19 @@ class Bodies:
 
     def _limit(self, path: str) -> int:
         if path in UPLOADS:
-            return self._max_upload
-        return self._max_body if path.endswith(LONG) else min(self._max_body, FREE)
+            return self._settings.max_upload_bytes
+        most = self._settings.max_body_bytes
+        return most if path.endswith(LONG) else min(most, FREE)
 
     async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
         """Receives a body of at most `limit` bytes. False if the client has left."""
         announced = _header(scope, b"content-length") or "0"
         if announced.isdigit() and int(announced) > limit:
             raise _too_large(limit)
-        loop = asyncio.get_running_loop()
-        begun = loop.time()
+        loop, patience = asyncio.get_running_loop(), self._settings.request_timeout
+        begun, slowest = loop.time(), self._settings.min_body_rate
         try:
-            async with asyncio.timeout_at(begun + self._patience) as deadline:
+            async with asyncio.timeout_at(begun + patience) as deadline:
                 while True:
                     message = await receive()
                     if message["type"] == "http.disconnect":
@@ -97,22 +175,37 @@ class Bodies:
                     if not message.get("more_body", False):
                         await body.end()
                         return True
-                    deadline.reschedule(begun + self._patience + body.size / self._slowest)
+                    deadline.reschedule(begun + patience + body.size / slowest)
         except TimeoutError:
             raise RequestTimeout(
                 f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
-                expected=f"all of it within {self._patience:g} s and 1 s more for each {self._slowest} bytes",
+                expected=f"all of it within {patience:g} s and 1 s more for each {slowest} bytes",
             ) from None
 
-    def _check_members(self, content: bytes | Path) -> None:
-        """Raises InputError for too many members: a schema makes an error for each unknown one."""
-        if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > self._members:
-            raise InputError(
-                "the body has too many members",
-                path="body",
-                got=content.count(b":"),
-                expected=f"at most {self._members}, where colons in texts count too",
-            )
+
+def received(request: Request) -> Body:
+    """The body of an upload, which bodies.py has received."""
+    body: Body = request.scope["state"]["body"]
+    return body
+
+
+def clear(folder: Path) -> None:
+    """Removes files that are older than an hour: they are left from servers that were killed."""
+    for path in folder.glob("*"):
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < time.time() - 3600:
+                path.unlink()
+
+
+def _check_members(content: bytes | Path) -> None:
+    """Raises InputError for too many members: a schema makes an error for each unknown one."""
+    if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > MEMBERS:
+        raise InputError(
+            "the body has too many members",
+            path="body",
+            got=content.count(b":"),
+            expected=f"at most {MEMBERS}, where colons in texts count too",
+        )
 
 
 def _too_large(limit: int) -> BodyTooLarge:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Hashable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from fastapi import Request
 
@@ -15,6 +15,7 @@ from specshield.service.heavy.pool import Pool, Template
 from specshield.service.problems import ClientGone, until_gone
 from specshield.service.settings import Settings
 
+R = TypeVar("R")
 # Niceness, chosen by hand: the server itself has 0, and the making of policies (`specshield worker`) 10 more.
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
@@ -42,7 +43,7 @@ class Heavy:
         """
         module, _, name = function.rpartition(":")
         asked = f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments
-        seconds, owner = self._settings.heavy_timeout, str(request.scope["state"].get("owner", ""))
+        seconds, owner = self._settings.heavy_timeout, request.scope["state"]["owner"]
         work = asyncio.ensure_future(self.tasks.run(*asked, seconds=seconds, owner=owner))
         gone = asyncio.ensure_future(until_gone(request.receive))
         try:
@@ -55,19 +56,14 @@ class Heavy:
             gone.cancel()
             await asyncio.gather(work, gone, return_exceptions=True)
 
-    async def decide(self, function: str, *arguments: Any, session: str, key: Hashable) -> Any:
-        """Calls a function of heavy/decisions.py with the settings first, when it is the session's turn.
+    async def decide(self, function: Callable[..., R], *args: Any, session: str, key: Sequence[str]) -> R:
+        """Calls a function with `Shields` of the other process first, when it is the session's turn.
 
         key: names what the process has to prepare, such as the policies: it is kept for further calls.
         """
-        return await self.decisions.run(
-            f"specshield.service.heavy.decisions:{function}",
-            self._settings,
-            *arguments,
-            seconds=DECISION_TIMEOUT,
-            owner=session,
-            key=key,
-        )
+        asked = "specshield.service.sessions.shields:call", self._settings, function, *args
+        made: R = await self.decisions.run(*asked, seconds=DECISION_TIMEOUT, owner=session, key=tuple(key))
+        return made
 
     def _unused(self, since: float) -> None:
         asyncio.get_running_loop().call_later(since + IDLE - time.monotonic(), self._stop_if_unused)

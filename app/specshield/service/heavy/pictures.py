@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from multiprocessing import get_context
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from specshield.drawing.svg import Plan
 from specshield.errors import PoseError
 from specshield.policy.notices import may_begin
 from specshield.service.heavy.uploads import policies_of
-from specshield.service.library.policies import Description
-from specshield.service.sessions import record, rules
+from specshield.service.sessions import record
+from specshield.service.sessions.rules import Rule
 from specshield.service.settings import Settings
 from specshield.service.storage.keeper import follow_parent
 from specshield.shield.decision import Shield, make_shield
@@ -64,16 +64,15 @@ def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
 
 
 def draw_session(
-    settings: Settings, config: dict[str, Any], t: int, rows: Floats, last: bytes, known: LearnedMap
+    settings: Settings, rule: Rule, t: int, rows: Floats, last: bytes, known: LearnedMap
 ) -> bytes:
     """The map, the regions, the way driven on this map, and the certified continuation of the last decision.
 
     rows: the session's rows on this map, none before the first step there. last: the record of step t, which
     is that of the last row, or b"". known: what the session has learned of the map.
     """
-    about = Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
-    task = policies_of(settings).task(about)
-    plan = Plan(task, f"session {config['id']} at step {t}")
+    task = policies_of(settings).task(rule.about)
+    plan = Plan(task, f"session {rule.id} at step {t}")
     plan.walls(known)
     plan.regions()
     decided = record.decode(last) if last else None
@@ -87,10 +86,10 @@ def draw_session(
     plan.line(str(task.formula), "ink formula")
     dashed = "" if witness is None else "; dashed: the certified continuation"
     drawn = f"The line is the way driven{dashed}." if len(rows) else "No pose on this map is known yet."
-    plan.line(f"{config['id']}, step {t}. {drawn}", "faint")
+    plan.line(f"{rule.id}, step {t}. {drawn}", "faint")
     if len(known):
         plan.line("Unlike the map: violet cells were found occupied, faint ones free.", "faint")
-    plan.line(f"The rule's last step is {rules.origin(config) + task.horizon}.", "faint")
+    plan.line(f"The rule's last step is {rule.origin + task.horizon}.", "faint")
     return plan.svg()
 
 

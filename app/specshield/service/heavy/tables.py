@@ -55,7 +55,10 @@ class Tables:
         making = self._making.peek(session)
         if making is not None and making.done():
             self._making.drop(session)
-            self._newest.put(session, making.result())
+            if (error := making.exception()) is None:
+                self._newest.put(session, making.result())
+            else:  # the session goes on without them, as before they were made
+                log.warning("tables for a session's own map cannot be made: %r", error)
             making = None
         newest = self._newest.peek(session)
         if newest is not None and newest.policies != _ids(shield):  # they are of an earlier rule

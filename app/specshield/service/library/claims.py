@@ -166,7 +166,8 @@ class Claimed:
     """What maps and policies share. claims: None where nothing is found by owner, added or deleted."""
 
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
-        self._kind, self.given, self._kept = kind, claims, files.Kept(settings, kind)
+        self._kind, self.given, self._settings = kind, claims, settings
+        self._kept = files.Kept(settings, kind)
         self._named: Mapping[str, Any] = {}  # what came with the server
 
     def check_name(self, name: str, id: str, owner: str) -> None:

@@ -64,7 +64,6 @@ class Maps(Claimed):
 
     def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
         super().__init__("maps", claims, settings)
-        self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named: Mapping[str, Map] = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
@@ -119,11 +118,11 @@ class Maps(Claimed):
             self.check_name(name, id if found is None else found.id, key.name)
         if found is not None:
             return found
-        if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
+        if len(files.to_json(_rooms_json(rooms))) > (most := self._settings.max_spec_bytes):
             raise MapError(
                 "the outlines of the rooms are too large",
                 path="rooms",
-                expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
+                expected=f"at most {most} bytes as JSON: simpler outlines",
             )
         made = Map(id, grid, rooms)
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})

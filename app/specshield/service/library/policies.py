@@ -15,6 +15,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from specshield.errors import FormulaError, InputError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.card import policy_id
 from specshield.policy.methods import METHODS, load_policy
@@ -64,21 +66,26 @@ class Policies(Claimed):
 
     def __init__(self, settings: Settings, maps: Maps) -> None:
         super().__init__("policies", maps.given, settings)
-        self._maps, self._models = maps, settings.models_dir
-        self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
+        self._maps = maps
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
+        self._given = {found.id: found for found in reversed(self._named.values())} | {**self._named}
 
     def record(self, key: str) -> Record:
         """A policy by its id, whoever owns it, or one that came with the server. Raises NotFound."""
-        for found in self._named.values():
-            if key in (found.name, found.id):
-                return found
+        found = self.made_here(key)
+        if found is None:
+            raise missing("policies", key)
+        return found
+
+    def made_here(self, key: str) -> Record | None:
+        """The policy of this id, or of this name if it came with the server; None if there is none."""
+        if key in self._given:
+            return self._given[key]
         stored = self._kept.find(key, "policy.json") if files.HASH.fullmatch(key) else None
         if stored is None:
-            raise missing("policies", key)
-        card = self._kept.find(key, "card.json")
-        return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
+            return None
+        return replace(msgspec.convert(stored, Record), card=self._kept.find(key, "card.json"))
 
     def find(self, key: str, owner: str) -> Record:
         """A policy that this owner may use, by its id or its name. Raises NotFound."""
@@ -89,9 +96,8 @@ class Policies(Claimed):
 
     async def still_there(self, ids: Sequence[str], owner: str) -> None:
         """Raises NotFound if a policy was deleted. To be called once a deletion can see that it is used."""
-        shipped = {record.id for record in self._named.values()}
         for id in ids:
-            if id not in shipped and not await self.claims.settled("policies", id, owner):
+            if id not in self._given and not await self.claims.settled("policies", id, owner):
                 raise missing("policies", id)
 
     def task(self, about: Description) -> Task:
@@ -105,7 +111,7 @@ class Policies(Claimed):
         try:
             regions, signals = spec.get("regions"), spec.get("signals")
             return make_task(
-                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._max_horizon
+                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._settings.max_horizon
             )
         except FormulaError as error:
             raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None
@@ -123,7 +129,7 @@ class Policies(Claimed):
             raise PolicyError(told, path="policy_id", got=record.id, expected=expected)
         task = self.task(record.about)
         if record.name is not None:
-            return load_policy(self._models / record.name / WEIGHTS, record.card, task)
+            return load_policy(self._settings.models_dir / record.name / WEIGHTS, record.card, task)
         return load_policy(self._kept.file(record.id, WEIGHTS), record.card, task)
 
     def resolve(self, about: Description, owner: str) -> Description:
@@ -139,9 +145,9 @@ class Policies(Claimed):
             if spec.get(kind):
                 spec[kind] = {name: value for name, value in spec[kind].items() if name in used}
         size = len(files.to_json(spec))
-        if size > self._max_spec:
+        if size > (most := self._settings.max_spec_bytes):
             told = "the spec is too large"
-            expected = f"at most {self._max_spec} bytes; only regions that the formula names count"
+            expected = f"at most {most} bytes; only regions that the formula names count"
             raise InputError(told, path="spec", got=f"{size} bytes as JSON", expected=expected)
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
@@ -153,13 +159,6 @@ class Policies(Claimed):
 
     def name_of(self, record: Record, owner: str) -> str | None:
         return record.name or self.claims.name_of("policies", record.id, owner)
-
-    def made_here(self, id: str) -> Record | None:
-        """The policy of this id, if there is one."""
-        try:
-            return self.record(id)
-        except NotFound:
-            return None
 
     def add_card(
         self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
@@ -192,8 +191,8 @@ class Policies(Claimed):
         """Keeps a policy for the owner of the key. trained: its files, if it is made already. Raises
         LimitReached and InsufficientStorage.
         """
-        if record.id in (found.id for found in self._named.values()):
-            return self.record(record.id)
+        if record.id in self._given:
+            return self._given[record.id]
         record = replace(record, created_at=files.now())
         stored = asdict(replace(record, card=None))
         del stored["card"]
@@ -250,7 +249,7 @@ class Policies(Claimed):
         return [record for record in found if record is not None], following
 
     def _shipped(self) -> Iterator[Record]:
-        for path in sorted(self._models.glob("*/card.json")):
+        for path in sorted(self._settings.models_dir.glob("*/card.json")):
             try:
                 card = json.loads(path.read_bytes())
                 about = describe(card)

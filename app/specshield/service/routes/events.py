@@ -15,12 +15,12 @@ from starlette.types import Receive, Scope, Send
 
 from specshield.errors import StoreError
 from specshield.service import examples
-from specshield.service.access.owners import Owner, scoped
 from specshield.service.problems import until_gone
 from specshield.service.routes.sessions import GONE, PathId, SessionKey
 from specshield.service.schemas.base import ID
 from specshield.service.sessions import chain
-from specshield.service.state import ServerState, problems
+from specshield.service.state import Owner, ServerState, problems
+from specshield.service.storage.store import scoped
 
 EVENTS = "text/event-stream"
 router = APIRouter(prefix="/v1", tags=["sessions"])

@@ -8,10 +8,9 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from specshield.service.access.owners import Owner
 from specshield.service.routes.policies import PolicyId
 from specshield.service.routes.sessions import GONE, SessionKey
-from specshield.service.state import TOO_MUCH, ServerState, problems
+from specshield.service.state import TOO_MUCH, Owner, ServerState, problems
 
 router = APIRouter(prefix="/v1")
 SVG = "image/svg+xml"

@@ -12,14 +12,24 @@ from specshield.errors import InUse, TrainingUnavailable
 from specshield.policy.methods import METHODS
 from specshield.service import examples
 from specshield.service.access.keys import Key
-from specshield.service.access.owners import Caller, Owner
-from specshield.service.bounds.body import received
+from specshield.service.bounds.bodies import received
 from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.maps import undeletable
 from specshield.service.library.policies import Record
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyResponse
-from specshield.service.state import FULL, TOO_MUCH, Cursor, Limit, Server, ServerState, json_body, problems
+from specshield.service.state import (
+    FULL,
+    TOO_MUCH,
+    Caller,
+    Cursor,
+    Limit,
+    Owner,
+    Server,
+    ServerState,
+    json_body,
+    problems,
+)
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])

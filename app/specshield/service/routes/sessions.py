@@ -10,7 +10,6 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Response
 from fastapi.responses import StreamingResponse
 
 from specshield.service import examples
-from specshield.service.access.owners import Caller, Owner, scoped
 from specshield.service.routes.messages import MSGPACK, accepts
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse, SwitchRequest
@@ -22,7 +21,8 @@ from specshield.service.schemas.steps import (
     StepResponse,
     Trajectory,
 )
-from specshield.service.state import Cursor, Limit, ServerState, problems
+from specshield.service.state import Caller, Cursor, Limit, Owner, ServerState, problems
+from specshield.service.storage.store import scoped
 from specshield.service.watch import logs
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
@@ -31,7 +31,7 @@ PathId = Annotated[
 ]
 
 
-def _key(session_id: PathId, owner: Owner) -> str:
+async def _key(session_id: PathId, owner: Owner) -> str:
     return scoped(owner, session_id)
 
 

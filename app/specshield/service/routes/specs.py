@@ -8,10 +8,9 @@ from typing import Any
 from fastapi import APIRouter, Request
 
 from specshield.service import examples
-from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
 from specshield.service.schemas.specs import SpecResponse
-from specshield.service.state import TOO_MUCH, ServerState, json_body, problems
+from specshield.service.state import TOO_MUCH, Owner, ServerState, json_body, problems
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
 SHORT = 16 << 10  # [bytes]; a body of this size is read within a few ms

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,8 +16,9 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import InputError
 from specshield.service.sessions import record
+from specshield.service.sessions import rules as ruled
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.rules import added, widened
+from specshield.service.sessions.rules import Rule, columns, widened
 
 FORMAT: Literal["specshield-record-1"] = "specshield-record-1"
 WHERE = "what GET /v1/sessions/{id}/record answers, or `save_record` of the SDK writes"
@@ -35,57 +36,19 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seal: bytes
 
 
-class Spec(msgspec.Struct, frozen=True):
-    formula: str
-    regions: dict[str, Any]
-    signals: dict[str, float]
-
-
-class Config(msgspec.Struct, frozen=True, kw_only=True):
-    """The members of a session's config that are needed to make its decisions again."""
-
-    id: str
-    policy_ids: list[str]
-    map_id: str
-    spec: Spec
-    robot: str | dict[str, Any]
-    horizon: int
-    actions: list[str]
-    terminal_actions: list[int]
-    seed: int
-    threshold: float
-    margin: float
-    slack: int = 0
-    evaluation: str
-    max_steps: int
-    shaping: str
-    uncertainty: Literal["learned", "none"] | dict[str, float] = "none"
-    threshold_over: Literal["step", "episode"] = "step"
-    learn_map: bool = False
-    map_memory: int | None = None
-    any_signal: bool = False
-    created_at: str = ""
-    version: str = ""
-    begins: int = msgspec.field(name="from", default=0)
-    origin: int = 0
-    clock: Literal["keep", "restart"] = "restart"
-    before: str = ""
-    way: str = ""
-
-
 class Chain(NamedTuple):
     """A record whose chain was checked. configs: one for each rule. names: for each rule, the signals of the
     columns that the rows had by then. rows [n, 3 + signals]. steps: b"" without a decision. seal: in hex.
     """
 
-    configs: Sequence[Config]
+    configs: Sequence[Rule]
     names: Sequence[list[str]]
     rows: Floats
     steps: Sequence[bytes]
     seal: str
 
     def rule_at(self, t: int) -> int:
-        return max(i for i, config in enumerate(self.configs) if config.begins <= t)
+        return ruled.at(self.configs, t)
 
     def decided(self) -> Iterator[tuple[int, bytes, StepRecord]]:
         for t, content in enumerate(self.steps):
@@ -95,10 +58,9 @@ class Chain(NamedTuple):
 
 def pack(config: bytes, rows: bytes, steps: Sequence[bytes]) -> tuple[bytes, str]:
     """The file, and its seal in hex. rows: exactly those that the session has."""
-    lines = config.split(b"\n")
-    configs = [msgspec.json.decode(line, type=Config) for line in lines]
-    held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(_names(configs)[-1]))
-    last, begin = record.digest(lines[-1]), configs[-1].begins
+    configs = ruled.read(config)
+    held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(columns(configs)[-1]))
+    last, begin = record.digest(config.rpartition(b"\n")[2]), configs[-1].begins
     for t, content in enumerate(steps):
         if content and t >= begin:
             last, begin = record.digest(content), t + 1
@@ -114,13 +76,12 @@ def read(content: bytes) -> Chain:
         raise _broken(None, "the file is too large", f"at most {LARGEST} bytes")
     try:
         file = msgspec.msgpack.decode(content, type=_File)
-        lines = file.config.split(b"\n")
-        configs = [msgspec.json.decode(line, type=Config) for line in lines]
+        configs, lines = ruled.read(file.config), file.config.split(b"\n")
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         raise _broken(None, "the file is no record of a session, or not all of one", WHERE) from None
     if msgspec.msgpack.encode(file) != content:
         raise _broken(None, "the file was changed: a server would write it otherwise", "the original bytes")
-    names = _names(configs)
+    names = columns(configs)
     rows = _rows(file.rows, 3 + len(names[-1]))
     if len(file.steps) > len(rows) or not all(file.steps[-1:]):  # no hash covers an empty one at the end
         told = f"there are {len(file.steps)} steps for {len(rows)} poses, or the last step is empty"
@@ -146,16 +107,7 @@ def read(content: bytes) -> Chain:
     return Chain(configs, names, rows, file.steps, file.seal.hex())
 
 
-def _names(configs: Sequence[Config]) -> list[list[str]]:
-    """For each rule, the signals of the rows' columns, in order, up to those that this rule added."""
-    names, found = list[str](), list[list[str]]()
-    for config in configs:
-        names = [*names, *added(names, config.spec.signals)]
-        found.append(names)
-    return found
-
-
-def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows: Floats) -> None:
+def _check_switches(configs: Sequence[Rule], names: Sequence[list[str]], rows: Floats) -> None:
     """Raises InputError unless the rules follow each other in time, and each column that a rule added holds
     the signal's initial value until that rule begins.
     """
@@ -168,7 +120,7 @@ def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows:
         if config.origin != (config.begins if config.clock == "restart" else old.origin):
             raise _broken(config.begins, f"the origin of a rule is not what `{config.clock}` means", None)
         first, known = rows[: config.begins, : 3 + len(names[i])], names[i - 1]
-        if widened(first[:, : 3 + len(known)], known, config.spec.signals).tobytes() != first.tobytes():
+        if widened(first[:, : 3 + len(known)], known, config.spec["signals"]).tobytes() != first.tobytes():
             raise _broken(config.begins, "a signal has values before its rule began", None)
 
 

@@ -14,11 +14,14 @@ import time
 from collections import Counter
 from itertools import islice
 
+import msgspec
+
 from specshield.errors import SpecshieldError
-from specshield.service.access.owners import owner_of
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.objects import left_out
+from specshield.service.storage.store import owner_of, shown
 
 BATCH = 1000  # ids, or files, that are looked at together
 AT_ONCE = 4  # sessions that are moved at the same time; each waits for its file to be on the disk
@@ -58,18 +61,24 @@ class Mover:
         moved, after = 0, None
         while True:
             idle, after = await self._store.idle(after, BATCH, self._ended)
-            due = [id for id, seconds, state in idle if seconds >= self._after or State.of(state).finished]
             free = asyncio.Semaphore(AT_ONCE)
-            moved += sum(await asyncio.gather(*(self._move(id, free) for id in due)))
+            moved += sum(await asyncio.gather(*(self._move(*each, free) for each in idle)))
             if after is None:
                 return moved
 
-    async def _move(self, id: str, free: asyncio.Semaphore) -> bool:
-        async with free:
-            dump = await self._store.dump(id)
-            if dump is None:
+    async def _move(self, id: str, seconds: float, state: bytes, free: asyncio.Semaphore) -> bool:
+        """Moves a session if it is due. One whose state another version has stored in another form stays."""
+        try:
+            if seconds < self._after and not State.of(state).finished:
                 return False
-            return await self._store.put_away(id, State.of(dump.state).expires_at, dump)
+            async with free:
+                dump = await self._store.dump(id)
+                if dump is None:
+                    return False
+                return await self._store.put_away(id, State.of(dump.state).expires_at, dump)
+        except msgspec.MsgspecError as error:
+            left_out(f"session {shown(id)!r} does not move to the archive: {error}")
+            return False
 
     async def sweep(self) -> Counter[str]:
         """Removes files that have expired and those that a newer one replaces. Returns the bytes that are

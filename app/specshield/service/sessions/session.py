@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from specshield import episode
 from specshield.arrays import Floats
@@ -15,16 +16,17 @@ from specshield.episode.handover import check_main_task
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
-from specshield.service.access.owners import shown
 from specshield.service.library import files
 from specshield.service.schemas import robots
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
 from specshield.service.sessions import rules as ruled
-from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.record import Asked, StepRecord
+from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.state import State
+from specshield.service.storage.store import Dump, Record, shown
+from specshield.shield import episode
 from specshield.service.storage.store import Dump, Record
 from specshield.shield.decision import Carry, Config, Decision, Shield
 
@@ -38,11 +40,11 @@ OBJECTS, PARSED = 3_000, 10
 class Session(NamedTuple):
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the samples of the signals.
 
-    rules: the config of each rule so far; the last one is in force. settings: those of the last one.
-    signal_names: by column. weight, held: bytes of the rules and of the state in the store.
+    rules: those so far; the last one is in force. settings: those of the last one. signal_names: by column.
+    weight, held: bytes of the rules and of the state in the store.
     """
 
-    rules: Sequence[Mapping[str, Any]]
+    rules: Sequence[Rule]
     settings: Config
     state: State
     version: bytes
@@ -54,13 +56,11 @@ class Session(NamedTuple):
     @staticmethod
     def of(stored: Record | Dump) -> Session:
         rules, state = ruled.read(stored.config), State.of(stored.state)
-        names = list[str]()
-        for config in rules:
-            names += ruled.added(names, config["spec"]["signals"])
+        names = ruled.columns(rules)[-1]
         width = 3 + len(names)
         rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
-        settings, sizes = settings_of(rules[-1]), (len(stored.config), len(stored.state))
-        return Session(rules, settings, state, stored.version, rows, names, *sizes)
+        sizes = len(stored.config), len(stored.state)
+        return Session(rules, rules[-1].settings, state, stored.version, rows, names, *sizes)
 
     @property
     def size(self) -> int:
@@ -68,13 +68,13 @@ class Session(NamedTuple):
         return OBJECTS + PARSED * self.weight + self.held + self.rows.nbytes
 
     @property
-    def config(self) -> Mapping[str, Any]:
-        """The config of the rule that is in force."""
+    def rule(self) -> Rule:
+        """The rule that is in force."""
         return self.rules[-1]
 
     @property
     def id(self) -> str:
-        return str(self.config["id"])
+        return self.rule.id
 
     @property
     def poses(self) -> Floats:
@@ -83,7 +83,7 @@ class Session(NamedTuple):
     @property
     def since(self) -> Floats:
         """The rows from the origin of the rule in force on, which are its history."""
-        return self.rows[ruled.origin(self.config) :]
+        return self.rows[self.rule.origin :]
 
     def extended(self, t: int, poses: Floats, signals: Mapping[str, float]) -> Session:
         """The session with its history up to t; signals that are not sent hold their last value."""
@@ -106,7 +106,7 @@ class Session(NamedTuple):
     def check_step(self, request: StepBody) -> None:
         """Raises what keeps a step that was not decided before from being decided now."""
         self.check_ahead(request.t, f"step {request.t} was passed over and can no longer be decided")
-        check_last(request.t, self.config["max_steps"])
+        check_last(request.t, self.rule.max_steps)
         check_main_task(self.state.main_task_done, request.main_task_done)
 
     def check_ahead(self, t: int, otherwise: str) -> None:
@@ -138,52 +138,52 @@ class Session(NamedTuple):
             expected = f"the same request again, or step {ahead}"
             raise StepConflict(told, path="t", got=t, expected=expected, expected_t=ahead)
         history.join(self.poses, request.t, np.array(request.poses))
-        return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)]["actions"])
+        return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)].actions)
 
     def learned(self) -> bytes:
         """The cells in which the session's own map differs from the map, as JSON."""
         known = self.state.learned
-        about = {"t": self.state.next_t - 1, "map_id": self.config["map_id"], "map_revision": known.revision}
+        about = {"t": self.state.next_t - 1, "map_id": self.rule.map_id, "map_revision": known.revision}
         occupied, free = (known.cell[known.occupied == held].tolist() for held in (True, False))
         return files.to_json({**about, "occupied": occupied, "free": free})
 
     def lines(self, steps: Sequence[bytes]) -> Iterator[bytes]:
         """One JSON object for each step: t, pose, signals, index of the rule, the logits sent, the answer."""
         for t, row in enumerate(self.rows):
-            held, rule = row.tolist(), ruled.at(self.rules, t)
-            config, values = self.rules[rule], dict(zip(self.signal_names, held[3:], strict=True))
-            signals = {name: values[name] for name in sorted(config["spec"]["signals"])}
-            head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": rule})
+            held, index = row.tolist(), ruled.at(self.rules, t)
+            rule, values = self.rules[index], dict(zip(self.signal_names, held[3:], strict=True))
+            signals = {name: values[name] for name in sorted(rule.spec["signals"])}
+            head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": index})
             step = steps[t] if t < len(steps) else b""
             kept = record.decode(step) if step else None
             logits = msgspec.json.encode(None if kept is None else record.logits_json(kept))
-            told = b"null" if kept is None else to_json(record.answer(kept, row, config["actions"]))
+            told = b"null" if kept is None else to_json(record.answer(kept, row, rule.actions))
             yield head[:-1] + b',"logits":' + logits + b',"decision":' + told + b"}"
 
 
-# The members of a config that the contract does not show, or shows in another form.
-INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way", "version")
+# The members of a rule that the contract does not show, or shows in another form.
+INSIDE = ("robot", "nonce", "owner", "begins", "origin", "clock", "before", "way", "version")
 
 
-def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]:
+def describe(rules: Sequence[Rule], state: State) -> dict[str, Any]:
     """The session as the contract shows it."""
-    shown = {name: value for name, value in rules[-1].items() if name not in INSIDE}
+    shown = {name: value for name, value in structs.asdict(rules[-1]).items() if name not in INSIDE}
     names = ("next_t", "feasible", "any_signal", "spec_status", "main_task_done", "finished")
     return {
         **shown,
-        "robot": robots.describe(robot_from_json(rules[-1]["robot"])),
+        "robot": robots.describe(robot_from_json(rules[-1].robot)),
         **{name: getattr(state, name) for name in names},
         "expires_at": files.rfc3339(state.expires_at),
         "rules": ruled.told(rules, [*state.verdicts, state.spec_status]),
     }
 
 
-def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
+def needed(rules: Sequence[Rule], state: State) -> set[str]:
     """The policies that the session still needs: those of the rule in force, and those of earlier rules whose
     verdicts are still open, since their maps are needed for these.
     """
-    waiting = [a for a, b in pairwise(rules) if ruled.begins(b) >= state.next_t]
-    return {id for config in [*waiting, rules[-1]] for id in config["policy_ids"]}
+    waiting = [a for a, b in pairwise(rules) if b.begins >= state.next_t]
+    return {id for rule in [*waiting, rules[-1]] for id in rule.policy_ids}
 
 
 def check_last(t: int, last: int) -> None:

@@ -24,14 +24,13 @@ from specshield.errors import InputError, LimitReached, NotFound, SpecshieldErro
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
-from specshield.service.access.owners import scoped
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest
 from specshield.service.sessions import chain, record, rules
-from specshield.service.sessions.config import asked_by, asked_for, stored
+from specshield.service.sessions.rules import Rule, asked_by, asked_for, stored
 from specshield.service.sessions.session import (
     RACES,
     Session,
@@ -49,18 +48,20 @@ from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.store import Change, Limit, exists, no_more, scoped
+from specshield.shield import episode
 from specshield.service.storage.store import Change, Limit, exists, no_more
 from specshield.shield.decision import USUAL_STEPS, Config, check_preferring
 from specshield.shield.preference import Preference
 from specshield.world.learned import LearnedMap
 
 R = TypeVar("R")
-Begun = tuple[dict[str, Any], State, Floats]  # the config, the state but for `expires_at`, the first row
+Begun = tuple[Rule, State, Floats]  # the state but for `expires_at`, the first row
 
 
 class Sessions:
     """All that takes long runs in threads or other processes, so that the event loop goes on. In these
-    methods the `id` of a session is its key in the store, which says whose it is (access/owners.py).
+    methods the `id` of a session is its key in the store, which says whose it is (storage/store.py).
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class Sessions:
         is_compiled: Callable[[str], bool],
     ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
-        self._shields = Shields(policies, settings.shield_cache, is_compiled)
+        self._shields = Shields(policies, is_compiled)
         self._threads = ThreadPoolExecutor(cores(), "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, self._shields, self._run, heavy, settings)
@@ -93,31 +94,28 @@ class Sessions:
         settings = self._checked(request)
         preference = None
         if request.shaping != PROJECTION:
-            asked = request.shaping, request.policies, request.initial_pose, key.name
-            preference = await self._shields.prepared(self._run, *asked)
+            about = request.shaping, request.policies, request.initial_pose, key.name
+            preference = await self._shields.prepared(self._run, *about)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
-        try:
-            begun: Begun  # in another process where the policies' decisions take long, else in a thread
+        asked = request, settings, preference, key.name
+        try:  # in another process where the policies' decisions take long, else in a thread
             if preference is None and await self._run(self._shields.slow_policies, ids):
-                begun = await self._heavy.decide(
-                    "begin", request, settings, key.name, session=",".join(ids), key=tuple(ids)
-                )
+                rule, state, rows = await self._heavy.decide(begin, *asked, session=",".join(ids), key=ids)
             else:
-                begun = await self._run(begin, self._shields, request, settings, preference, key.name)
+                rule, state, rows = await self._run(begin, self._shields, *asked)
         except Exception:  # where a policy was deleted meanwhile, that is the error to tell of
             await self._policies.still_there(ids, key.name)
             raise
-        config, state, rows = begun
         state = msgspec.structs.replace(state, expires_at=time.time() + self._settings.session_ttl)
-        stored_as = scoped(key.name, config["id"])
+        stored_as = scoped(key.name, rule.id)
         change = Change(state.packed(), pack(rows))
-        await self._store.create(stored_as, files.to_json(config), change, *limits)
+        await self._store.create(stored_as, rules.line(rule), change, *limits)
         try:  # a deletion of a policy sees this session from now on; an earlier one has left a mark
-            await self._policies.still_there(config["policy_ids"], key.name)
+            await self._policies.still_there(rule.policy_ids, key.name)
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
-        return describe([config], state)
+        return describe([rule], state)
 
     def _checked(self, request: SessionRequest) -> Config:
         """The session's settings. Raises InputError for settings that are not allowed."""
@@ -163,7 +161,7 @@ class Sessions:
             session = Session.of(there(await self._store.load(id), id))
             state = session.state
             if request.t is not None and request.poses is not None:
-                check_last(request.t, session.config["max_steps"] + 1)  # where the last step led
+                check_last(request.t, session.rule.max_steps + 1)  # where the last step led
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise session.over(request.t)
@@ -187,7 +185,7 @@ class Sessions:
     def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
         session = self._shields.settled(session)
         try:
-            return session, *self._shields.verdict(session.config, session.rows, session.signal_names)
+            return session, *self._shields.verdict(session.rule, session.rows, session.signal_names)
         except NotFound:  # the map of a session that has ended may have been deleted
             if not session.state.finished:
                 raise
@@ -209,17 +207,17 @@ class Sessions:
         session = Session.of(there(await self._store.load(id), id))
         return await self._run(session.learned)
 
-    async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes, LearnedMap]:
-        """What a picture needs: the session's config, its last step, the rows since it came to its map, the
+    async def last(self, id: str) -> tuple[Rule, int, Floats, bytes, LearnedMap]:
+        """What a picture needs: the session's rule, its last step, the rows since it came to its map, the
         record of the last step, b"" if the rule in force did not decide that, and what it learned of the map.
         """
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
         t = len(session.rows) - 1
-        decided = rules.begins(session.config) <= t < len(found.steps)
-        came = (rules.begins(b) for a, b in pairwise(session.rules) if a["map_id"] != b["map_id"])
+        decided = session.rule.begins <= t < len(found.steps)
+        came = (b.begins for a, b in pairwise(session.rules) if a.map_id != b.map_id)
         rows = session.rows[max(came, default=0) :]
-        return dict(session.config), t, rows, found.steps[t] if decided else b"", session.state.learned
+        return session.rule, t, rows, found.steps[t] if decided else b"", session.state.learned
 
     async def using(self, owner: str, policy_id: str) -> str | None:
         """The id of a session of this owner, in the store or the archive, that still needs this policy."""
@@ -229,7 +227,7 @@ class Sessions:
             for config, state in found:
                 had, now = rules.read(config), State.of(state)
                 if not now.finished and policy_id in needed(had, now):
-                    return str(had[-1]["id"])
+                    return had[-1].id
             if after is None:
                 return None
 
@@ -270,26 +268,25 @@ def begin(
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
     status, _ = episode.close(shield, rows[:, :3], rules.signals_in(rows, signals))
-    config = {
-        "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
+    rule = Rule(
+        id=request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
         **asked_by(ids, about, task),
-        **stored(settings, request),
-        "shaping": request.shaping,
-        "max_steps": shield.max_steps,
-        "created_at": files.now(),
-        "owner": owner,
-        "nonce": secrets.token_hex(8),
-        "version": __version__,
-        "way": (way or b"").hex(),
-    }
+        **{**stored(settings, request), "max_steps": shield.max_steps},
+        shaping=request.shaping,
+        created_at=files.now(),
+        owner=owner,
+        nonce=secrets.token_hex(8),
+        version=__version__,
+        way=(way or b"").hex(),
+    )
     state = State(
         length=1,
         next_t=0,
         feasible=feasible,
         spec_status=status,
         expires_at=0.0,
-        head=record.digest(files.to_json(config)),
-        carry=handover.begun(rules.way(config)),
+        head=record.digest(rules.line(rule)),
+        carry=handover.begun(rule.found),
         any_signal=any_signal(shield, rows[:, :3]),
     )
-    return config, state, rows
+    return rule, state, rows

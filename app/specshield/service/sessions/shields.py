@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
-from typing import Any
+from functools import cache
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -18,15 +19,21 @@ from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
 from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
+from specshield.service.heavy.uploads import policies_of
 from specshield.service.library import files
-from specshield.service.library.policies import Description, Policies
+from specshield.service.library.policies import Policies
 from specshield.service.sessions import record, rules
+from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session
+from specshield.service.settings import Settings
+from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
+R = TypeVar("R")
 Bounds = tuple[float, float]
 Run = Callable[..., Awaitable[Any]]  # calls a function in a thread
+SHIELDS = 32  # kept in memory; chosen by hand
 QUICK = ("reachability", "dqn")  # methods whose decisions take about a millisecond; others may take long
 
 
@@ -35,15 +42,13 @@ class Shields:
     decision waits for it.
     """
 
-    def __init__(
-        self, policies: Policies, room: int, is_compiled: Callable[[str], bool] = lambda part: True
-    ) -> None:
-        """room: for so many shields. is_compiled: whether the kernels of a part of warmup.LATER are compiled,
-        so that decisions need not do it. A method that is quick once they are is called like its part.
+    def __init__(self, policies: Policies, is_compiled: Callable[[str], bool] = lambda part: True) -> None:
+        """is_compiled: whether the kernels of a part of warmup.LATER are compiled, so that decisions need not
+        do it. A method that is quick once they are is called like its part.
         """
         self.policies, self._is_compiled = policies, is_compiled
-        self._shields = files.Recent[Shield](room)
-        self._judges = files.Recent[Shield](room)  # shields without policies, for verdicts, by digest
+        self._shields = files.Recent[Shield](SHIELDS)
+        self._judges = files.Recent[Shield](SHIELDS)  # shields without policies, for verdicts, by digest
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self.tables = Tables()
@@ -52,11 +57,11 @@ class Shields:
 
     def slow(self, session: Session) -> bool:
         """Whether decisions take long and another process can make them, which has no prepared preference."""
-        if session.config["shaping"] != PROJECTION:
+        if session.rule.shaping != PROJECTION:
             return False
         over_episode = session.settings.threshold_over == "episode"
         compiles = over_episode and not self._is_compiled("chances")
-        return compiles or self.slow_policies(session.config["policy_ids"])
+        return compiles or self.slow_policies(session.rule.policy_ids)
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)
@@ -71,7 +76,7 @@ class Shields:
 
     def note_slow(self, session: Session) -> None:
         """From now on the decisions of sessions with these policies count as slow."""
-        self._slow.put(tuple(session.config["policy_ids"]), True)
+        self._slow.put(tuple(session.rule.policy_ids), True)
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
         def make() -> Shield:
@@ -82,8 +87,8 @@ class Shields:
 
     def of(self, session: Session) -> Shield:
         """The session's shield, with its preference if that is prepared."""
-        shield = self.get(session.config["policy_ids"], session.settings)
-        if session.config["shaping"] == PROJECTION:
+        shield = self.get(session.rule.policy_ids, session.settings)
+        if session.rule.shaping == PROJECTION:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
 
@@ -101,32 +106,32 @@ class Shields:
         preference: Preference = await asyncio.shield(asyncio.wrap_future(await run(begin)))
         return preference
 
-    def verdict(self, config: Mapping[str, Any], rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
+    def verdict(self, rule: Rule, rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
         """The verdict on a rule by a session's rows [t + 1, 3 + signals], and the bounds on its robustness.
 
         No policy is needed: the policies of an earlier rule may have been deleted.
         """
-        since = rows[rules.origin(config) :]
+        since = rows[rule.origin :]
         if not len(since):
             return "pending", (-math.inf, math.inf)
-        asked = [config[name] for name in ("map_id", "robot", "spec")]
-        judge = self._judges.get(record.digest(files.to_json(asked)), lambda: self._judge(*asked))
+        asked = record.digest(files.to_json((rule.map_id, rule.robot, rule.spec)))
+        judge = self._judges.get(asked, lambda: self._judge(rule))
         return episode.close(judge, since[:, :3], rules.signals_in(since, names))
 
-    def _judge(self, map_id: str, robot: str | dict[str, Any], spec: dict[str, Any]) -> Shield:
+    def _judge(self, rule: Rule) -> Shield:
         """A shield for verdicts. It is kept, since what `view_of` prepares keeps each task in memory."""
-        task = self.policies.task(Description(map_id, robot, spec, "", 0, {}))
+        task = self.policies.task(rule.about)
         body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
         return Shield(task, (), Config(), body, view)
 
     def settled(self, session: Session) -> Session:
         """The session with the verdicts of the rules that its last switch ended, once x_t is known."""
-        begins, state = rules.begins(session.config), session.state
+        begins, state = session.rule.begins, session.state
         if state.finished or state.next_t > begins or len(session.rows) <= begins:
             return session
         last, verdicts = session.rows[: begins + 1], list(state.verdicts)
         for i in range(len(verdicts)):
-            if rules.begins(session.rules[i + 1]) == begins:
+            if session.rules[i + 1].begins == begins:
                 verdicts[i], _ = self.verdict(session.rules[i], last, session.signal_names)
         return session._replace(state=msgspec.structs.replace(state, verdicts=tuple(verdicts)))
 
@@ -145,8 +150,18 @@ class Shields:
         A missing one is begun unless another is being prepared: with more tasks than are kept, requests would
         pile up, and a caller who creates a session would wait for all of them.
         """
-        name, ids = session.config["shaping"], session.config["policy_ids"]
+        name, ids = session.rule.shaping, session.rule.policy_ids
         found = self._preferences.peek((name, *ids))
         if found is None and (self._latest is None or self._latest.done()):
             found = self._prepare(name, ids, shield, session.poses[-1])
         return found.result() if found is not None and found.done() and found.exception() is None else None
+
+
+@cache
+def _own(settings: Settings) -> Shields:
+    return Shields(policies_of(settings))
+
+
+def call(settings: Settings, function: Callable[..., R], *arguments: Any) -> R:
+    """Calls the function in a process for decisions (heavy/heavy.py), with the shields of that process."""
+    return function(_own(settings), *arguments)

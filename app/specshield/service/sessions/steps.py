@@ -169,19 +169,19 @@ class Steps:
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
-        ids = tuple(session.config["policy_ids"])
-        made: Decided
+        ids = tuple(session.rule.policy_ids)
         if self._shields.slow(session):
-            made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
+            asked = timed, session, request
+            made, seconds, _ = await self._heavy.decide(*asked, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
         # A step may take long once the map is no longer the one that the policies were made for.
         learns = bool(request.occupied or request.free or session.state.has_learned)
-        pace = self._paces.get((session.config["shaping"], *ids), Pace)
+        pace = self._paces.get((session.rule.shaping, *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
-            loop, asked = asyncio.get_running_loop(), (self._shields, session, request)
-            made, seconds, cpu = await loop.run_in_executor(self._threads, timed, *asked)
+            run = asyncio.get_running_loop().run_in_executor
+            made, seconds, cpu = await run(self._threads, timed, self._shields, session, request)
         elif pace.doubted:
             made, seconds, cpu = timed(self._shields, session, request)
         else:  # measuring the thread's own time would cost a tenth of the step
@@ -207,6 +207,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
+    shield, tables = shields.tables.of(session.rule.nonce, shield, state.learned)
     before, since = record.link(state.head, session.rows[state.next_t :]), session.since
     return Decided(session, *decide(shield, asked, request.t, since, names, state.carry, before, tables))

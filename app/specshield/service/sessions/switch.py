@@ -16,10 +16,9 @@ from specshield.errors import InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
-from specshield.service.library import files
 from specshield.service.schemas.sessions import SwitchRequest
 from specshield.service.sessions import history, record, rules
-from specshield.service.sessions.config import asked_by, settings_of
+from specshield.service.sessions.rules import asked_by
 from specshield.service.sessions.session import RACES, Session, check_last, contended, describe, pack, there
 from specshield.service.sessions.shields import Run, Shields
 from specshield.service.settings import Settings
@@ -50,8 +49,7 @@ class Switches:
             before, after = session.rows.shape[1], made.rows.shape[1]
             rows = made.added(session.state.length) if before == after else (pack(made.rows), 0)
             state = msgspec.structs.replace(made.state, expires_at=time.time() + self._ttl)
-            line = files.to_json(made.config)
-            change = Change(state.packed(), *rows, config=b"\n".join([found.config, line]))
+            change = Change(state.packed(), *rows, config=b"\n".join([found.config, rules.line(made.rule)]))
             version = await self._store.append(id, session.version, change)
             if not isinstance(version, bytes):
                 continue
@@ -66,12 +64,10 @@ class Switches:
     async def _made(self, wanted: Wanted, owner: str) -> Session:
         """The session under its new rule, made in a thread, or in another process for slow policies."""
         session, ids = wanted.session, wanted.policy_ids
-        shaping = session.config["shaping"]
+        shaping = session.rule.shaping
         if shaping == PROJECTION and await self._run(self._shields.slow_policies, ids):
-            made: Session = await self._heavy.decide(
-                "switched", wanted, self._most, session=session.id, key=tuple(ids)
-            )
-            return made
+            asked = switched, wanted, self._most
+            return await self._heavy.decide(*asked, session=session.id, key=ids)
         if shaping != PROJECTION:
             await self._shields.prepared(self._run, shaping, ids, wanted.row[:3].tolist(), owner)
         here: Session = await self._run(switched, self._shields, wanted, self._most)
@@ -96,8 +92,8 @@ def _is_last(session: Session, request: SwitchRequest, policy_ids: Sequence[str]
     """
     if len(session.rules) == 1:
         return False
-    last = session.config
-    made = rules.begins(last), last["policy_ids"], last["clock"]
+    last = session.rule
+    made = last.begins, last.policy_ids, last.clock
     if made != (request.t, list(policy_ids), request.clock):
         return False
     if request.poses is not None:
@@ -130,26 +126,26 @@ def _foreseen(session: Session, step: bytes) -> Sequence[float]:
     """The pose to which the last decision's action leads, which the SDK calls `execute`. The robot is the one
     of that decision: an earlier switch at the same step may have brought another one.
     """
-    config = session.rules[rules.at(session.rules, len(session.rows) - 1)]
-    answer = record.answer(record.decode(step), session.rows[-1], config["actions"])
+    rule = session.rules[rules.at(session.rules, len(session.rows) - 1)]
+    answer = record.answer(record.decode(step), session.rows[-1], rule.actions)
     action: int | None = answer.action
-    if action in config["terminal_actions"]:
+    if action in rule.terminal_actions:
         action = answer.completion_action
     return session.rows[-1, :3].tolist() if action is None else answer.next_poses[action]
 
 
 def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError, StoreError."""
-    session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.config
+    session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.rule
     about = shields.policies.record(wanted.policy_ids[0]).about
     task = shields.get(wanted.policy_ids, Config()).task
-    origin = t if wanted.clock == "restart" else rules.origin(old)
+    origin = t if wanted.clock == "restart" else old.origin
     last = origin + task.horizon + 1
-    if last > max(most_steps, old["max_steps"]):
+    if last > max(most_steps, old.max_steps):
         told = "the rule ends after the last step that a session can have"
         expected = f"at most step {most_steps}"
         raise InputError(told, path="policy_id", got=f"step {last}", expected=expected)
-    most = max(old["max_steps"], last)
+    most = max(old.max_steps, last)
     check_last(t, most)
     signals = task.signals
     names = [*session.signal_names, *rules.added(session.signal_names, signals)]
@@ -158,31 +154,31 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         expected = f"at most {record.MOST_SIGNALS}; or a new session for this rule"
         raise InputError(told, path="policy_id", got=len(names), expected=expected)
     before = record.link(session.state.head, session.rows[session.state.next_t : t])
-    config = {
-        **old,
+    rule = msgspec.structs.replace(
+        old,
         **asked_by(wanted.policy_ids, about, task),
-        "max_steps": most,
-        "from": t,
-        "origin": origin,
-        "clock": wanted.clock,
-        "before": before.hex(),
-        "version": __version__,
-        "way": "",
-    }
+        max_steps=most,
+        begins=t,
+        origin=origin,
+        clock=wanted.clock,
+        before=before.hex(),
+        version=__version__,
+        way="",
+    )
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)
     made = session._replace(
-        rules=[*session.rules, config],
-        settings=settings_of(config),
+        rules=[*session.rules, rule],
+        settings=rule.settings,
         rows=rules.widened(session.rows, session.signal_names, signals),
         signal_names=names,
     )
     carry, _ = session.state.carry, session.state.learned  # raises StoreError for what cannot be read
-    known = rules.carried_over(carry, old, config)
+    known = rules.carried_over(carry, old, rule)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
-    elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
+    elsewhere = (old.map_id, old.robot) != (rule.map_id, rule.robot)
     way = refusal.switch(shield, seen[:, :3], rules.signals_in(seen, names), known, elsewhere)
-    config["way"] = (way or b"").hex()
+    rule = msgspec.structs.replace(rule, way=(way or b"").hex())
     rows = made.since
     status = episode.close(shield, rows[:, :3], rules.signals_in(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
@@ -191,9 +187,9 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         next_t=t,
         feasible=True,
         spec_status=status,
-        head=record.digest(files.to_json(config)),
+        head=record.digest(rules.line(rule)),
         carry=known._replace(way=way),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], rules.signals_in(seen, names)),
     )
-    return made._replace(state=state)
+    return made._replace(rules=[*session.rules, rule], state=state)

@@ -20,9 +20,8 @@ import msgspec
 import zstandard
 
 from specshield.errors import StoreError
-from specshield.service.access.owners import scoped
 from specshield.service.storage.objects import Objects, left_out
-from specshield.service.storage.store import Dump
+from specshield.service.storage.store import Dump, scoped
 
 MAGIC = b"specshield session 1\n"
 FOLDER = 8  # characters of an id that name its folder; ids that the server makes in one minute share them
@@ -111,22 +110,15 @@ class Archive:
     def remove(self, entry: Entry) -> None:
         self._objects.remove(entry.path)
 
-    def remove_older(self, entry: Entry) -> int:
-        """Removes the older files of the session. Returns their bytes."""
+    def erase(self, key: str, before: Entry | None = None) -> int:
+        """Removes the files of a session, all of them or those that are older. Returns their bytes."""
         gone = 0
-        for path, size in self._objects.sizes(_folder(entry.key)):
-            other = Entry.of(entry.key, path.rpartition("/")[2])
-            if other is not None and other < entry:
-                self.remove(other)
+        for path, size in self._objects.sizes(_folder(key)):
+            entry = Entry.of(key, path.rpartition("/")[2])
+            if entry is not None and (before is None or entry < before):
+                self.remove(entry)
                 gone += size
         return gone
-
-    def erase(self, key: str) -> int:
-        """Removes all files of a session. Returns their bytes, 0 if there was none."""
-        size = sum(size for _, size in self._objects.sizes(_folder(key)))
-        for entry in self.entries(key):
-            self.remove(entry)
-        return size
 
     def after(self, owner: str, id: str | None) -> Iterator[Entry]:
         """The latest file of each session of an owner that has not expired, in order of id, after this id."""

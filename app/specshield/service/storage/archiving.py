@@ -18,9 +18,19 @@ from typing import ParamSpec, TypeVar
 
 import anyio
 
-from specshield.service.access.owners import owner_of, scoped
 from specshield.service.storage.archive import Archive
-from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, exists, keys
+from specshield.service.storage.store import (
+    INDEX,
+    PAGE_BYTES,
+    Change,
+    Dump,
+    Record,
+    Store,
+    exists,
+    keys,
+    owner_of,
+    scoped,
+)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -200,7 +210,7 @@ class ArchivingStore(Store):
             if left > 0:
                 await self.take_off([id.encode()])
         if left > 0:
-            size -= await self.in_thread(self.archive.remove_older, entry)
+            size -= await self.in_thread(self.archive.erase, id, entry)
         else:
             await self.in_thread(self.archive.remove, entry)
             size = 0

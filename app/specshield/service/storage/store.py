@@ -2,8 +2,10 @@
 
 A session has three keys in one slot that expire together: `specshield:v2:{id}:session`, a hash of config,
 state and version; `:rows`, its poses and signals; `:steps`, the list of the steps' records. The `id` of a
-session is its key `owner@id` (access/owners.py). The ids are also in `specshield:sessions`, a sorted set in
-which the sessions of one owner stand together; it may still name sessions that have expired.
+session is its key `owner@id`, so two owners may choose the same id, and nobody finds the session of another
+owner. The owner is the name of the API key that made it, or "" if the server asks for no key or the key was
+that of SPECSHIELD_API_KEY. The ids are also in `specshield:sessions`, a sorted set in which the sessions of
+one owner stand together; it may still name sessions that have expired.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import anyio
 import redis
 
 from specshield.errors import LimitReached, SessionExists
-from specshield.service.access.owners import shown
 from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
@@ -62,9 +63,10 @@ class Dump(NamedTuple):
 
 
 class News(NamedTuple):
-    """A session's state, and its rows and steps, as in `Dump`, from some step on."""
+    """A session's state and version, and its rows and steps, as in `Dump`, from some step on."""
 
     state: bytes
+    version: bytes
     rows: bytes
     steps: list[bytes]
 
@@ -126,7 +128,7 @@ class Store:
         has to be unique, so that a second try recognizes the session that a first one created.
         """
         await self.list_name(id, *limits)
-        begun = await self._write(id, b"", change, config)
+        begun = await self._write(id, b"", change._replace(config=config))
         if isinstance(begun, Record) and begun.config == config:  # by an earlier try whose answer was lost
             begun = begun.version
         if not isinstance(begun, bytes):
@@ -157,21 +159,21 @@ class Store:
         any more, writes nothing and returns the session with the record of step `change.t`, None if it is
         gone.
         """
-        return await self._write(id, version, change, change.config)
+        return await self._write(id, version, change)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session with the record of step t; None if there is no session. One round trip."""
-        found = await self._write(id, NO_VERSION, Change(b"", t=t), b"")
+        found = await self._write(id, NO_VERSION, Change(b"", t=t))
         assert not isinstance(found, bytes)
         return found
 
-    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
+    async def _write(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
         """A command that is lost on the way is sent again. An append that arrives twice is made once: the
         second one finds another version.
         """
         field = "" if change.t is None else change.t
-        args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
-        args += (self._ttl * 1000, int(self._replicas > 0))
+        args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state]
+        args += (change.config, self._ttl * 1000, int(self._replicas > 0))
         with reaching():
             written = await self._wire.run(APPEND, keys(id), args)
         if isinstance(written, bytes):
@@ -203,11 +205,6 @@ class Store:
                     await self.take_off(gone)
                 low = f"({ids[-1].decode()}"
 
-    async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
-        """The version of each session, None for one that the store does not have. One round trip."""
-        async with self._reaching():
-            return await self._of_each(ids, "hget", "version")
-
     async def news(self, asked: Sequence[tuple[str, int, int, int]]) -> list[News | None]:
         """For each (id, t, bytes of a row, count) what the session has from step t on, for `count` steps."""
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
@@ -215,10 +212,13 @@ class Store:
                 session, rows, steps = keys(id)
                 pipe.lrange(steps, t, t + count - 1)
                 pipe.getrange(rows, t * width, (t + count) * width - 1)  # after the steps: has all their rows
-                pipe.hget(session, "state")  # last, so that it shows a switch that made the rows wider
+                pipe.hmget(session, "state", "version")  # last: it shows a switch that made the rows wider
             found = await pipe.execute()
         three = zip(found[::3], found[1::3], found[2::3], strict=True)
-        return [None if state is None else News(state, rows, steps) for steps, rows, state in three]
+        return [
+            None if state is None else News(state, version, rows, steps)
+            for steps, rows, (state, version) in three
+        ]
 
     async def held_bytes(self) -> int | None:
         """The bytes of memory that the store takes; in a cluster all masters together, without replicas. None
@@ -257,6 +257,24 @@ class Store:
 def _range(owner: str | None) -> tuple[str, str]:
     """The bounds of an owner's names in INDEX: owner@ to before ownerA (A follows @); for None, of all."""
     return ("-", "+") if owner is None else (f"[{owner}@", f"({owner}A")
+
+
+def scoped(owner: str, id: str) -> str:
+    """
+    >>> scoped("alice", "run-1")
+    'alice@run-1'
+    """
+    return f"{owner}@{id}"
+
+
+def owner_of(key: str) -> str:
+    """The owner in a session's key."""
+    return key.partition("@")[0]
+
+
+def shown(key: str) -> str:
+    """The id, as callers know it, in a session's key."""
+    return key.partition("@")[2]
 
 
 def keys(id: str) -> list[str]:

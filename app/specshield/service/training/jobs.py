@@ -92,7 +92,7 @@ class Jobs:
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
             error = "the store has lost the state of its training; ask for it again"
-        if status == "queued" and not alive and not self._waits(state):
+        if status == "queued" and not alive and not self._waits(state["method"], state["attempt"]):
             self.sign_of_life(id, state["attempt"])  # a worker has it; if that has died, this ends soon
             self.report(id, state["attempt"], status="training")
             status = "training"
@@ -103,9 +103,8 @@ class Jobs:
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
-    def _waits(self, state: dict[str, str]) -> bool:
-        key = self._queue(state["method"]).key
-        return reached(lambda: self.redis.lpos(key, state["attempt"])) is not None
+    def _waits(self, method: str, attempt: str) -> bool:
+        return reached(lambda: self.redis.lpos(self._queue(method).key, attempt)) is not None
 
     def cancel(self, id: str) -> None:
         """Cancels a run. One that has begun ends within about a second, a queued one when it begins."""

@@ -18,13 +18,12 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from specshield.arrays import Floats
 from specshield.errors import LimitReached, NotFound, SpecshieldError
 from specshield.service import metrics
-from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import News, Store
+from specshield.service.storage.store import News, Store, shown
 from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
 # All chosen by hand.
@@ -89,7 +88,7 @@ class Watchers:
         than this step, or it follows a switch, it is read from the store later, with all that they lack.
         """
         feed = self._feeds.get(id)
-        if feed is not None and feed.version == before and made.t >= feed.end > rules.begins(feed.rules[-1]):
+        if feed is not None and feed.version == before and made.t >= feed.end > feed.rules[-1].begins:
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
             feed.version, feed.here = after, time.monotonic()
@@ -183,39 +182,34 @@ class Watchers:
     async def _look(self, feeds: list[Feed]) -> None:
         if not feeds:
             return
-        before = [feed.version for feed in feeds]
-        versions = await self._store.versions([feed.id for feed in feeds])
-        seen = list(zip(feeds, before, versions, strict=True))
-        gone_on = [
-            (feed, version) for feed, known, version in seen if version != known and feed.version == known
-        ]  # sessions that were decided here meanwhile are looked at next time
-        if here := [(feed, version) for feed, version in gone_on if version is not None]:
-            ends = [feed.end for feed, _ in here]
-            news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
-            for (feed, version), end, new in zip(here, ends, news, strict=True):
-                if feed.end != end or new is None:  # it has changed or left the store meanwhile: next time
-                    continue
-                if feed.version is None:  # it is back from the archive, or another session has its id
-                    if await self._switched(feed):
-                        feed.version = b""
-                    else:
-                        feed.close()
-                elif not feed.outdated(new) or not await self._switched(feed):
-                    self._gone_on(feed, version, new)
+        before = [(feed.version, feed.end) for feed in feeds]
+        news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed in feeds])
         since = time.monotonic() - AWAY
-        for feed, known, now in seen:
-            if now is None and feed.version == known and (known is not None or feed.looked < since):
-                await self._left(feed)
+        for feed, known, new in zip(feeds, before, news, strict=True):
+            if (feed.version, feed.end) != known:  # a step was decided here meanwhile: next time
+                continue
+            if new is None:
+                if feed.version is not None or feed.looked < since:
+                    await self._left(feed)
+            elif new.version != feed.version:
+                await self._gone_on(feed, new)
 
-    def _gone_on(self, feed: Feed, version: bytes, new: News) -> None:
-        if begun(version) != begun(feed.version or version):
-            feed.close()  # it was erased, and another session was begun with its id
+    async def _gone_on(self, feed: Feed, new: News) -> None:
+        if feed.version is None:  # it is back from the archive, or another session has its id
+            if await self._switched(feed):
+                feed.version = b""
+            else:
+                feed.close()
+        elif feed.outdated(new) and await self._switched(feed):
             return
-        state, (found, end) = State.of(new.state), feed.events(feed.end, new)
-        upto = feed.reached(end, new)
-        feed.add(state, found, end, upto)
-        if upto >= state.next_t:  # else the next look reads the rest
-            feed.version = version
+        elif begun(new.version) != begun(feed.version or new.version):
+            feed.close()  # it was erased, and another session was begun with its id
+        else:
+            state, (found, end) = State.of(new.state), feed.events(feed.end, new)
+            upto = feed.reached(end, new)
+            feed.add(state, found, end, upto)
+            if upto >= state.next_t:  # else the next look reads the rest
+                feed.version = new.version
 
     async def _switched(self, feed: Feed) -> bool:
         """Reads the rules again; other news are for the next look. False if the session is gone."""
@@ -230,7 +224,7 @@ class Watchers:
         if dump is None or not feed.rule(Session.of(dump)):
             feed.close()
         else:
-            new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
+            new = News(dump.state, dump.version, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
             state, (found, _) = State.of(dump.state), feed.events(feed.end, new)
             feed.add(state, found, state.next_t, state.next_t)
         feed.version = None
@@ -244,7 +238,7 @@ class Watchers:
             dump = await self._store.dump(feed.id)
             if dump is None or not feed.rule(Session.of(dump)):
                 return [], feed.end
-            new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
+            new = News(dump.state, dump.version, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
         elif feed.outdated(new):
             return [], t if await self._switched(feed) else feed.end
         found, end = feed.events(t, new)

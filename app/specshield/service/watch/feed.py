@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -14,13 +14,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.sessions import record, rules
 from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session, describe
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import News
+from specshield.service.storage.store import News, shown
 
 KEPT = 64  # events that are kept for the watchers of a session, and the most that are read at once
 
@@ -68,7 +68,7 @@ class Feed:
     """
 
     id: str
-    rules: Sequence[Mapping[str, Any]]
+    rules: Sequence[Rule]
     told: list[dict[str, Any]]
     width: int
     version: bytes | None
@@ -106,7 +106,7 @@ class Feed:
     def rule(self, session: Session) -> bool:
         """Takes over the session's rules. False if this is another session with the same id."""
         rules, told, width = ruled(session)
-        if rules[0].get("nonce") != self.rules[0].get("nonce"):
+        if rules[0].nonce != self.rules[0].nonce:
             return False
         self.rules, self.told, self.width = rules, told, width
         return True
@@ -131,7 +131,7 @@ class Feed:
                 row = np.frombuffer(new.rows[i * self.width : (i + 1) * self.width], "<f8")
                 rule = rules.at(self.rules, t + i)
                 kept = record.decode(step)
-                answer = record.answer(kept, row, self.rules[rule]["actions"])
+                answer = record.answer(kept, row, self.rules[rule].actions)
                 switch = b""
                 while switched and switched[0]["from"] <= t + i:
                     switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
@@ -143,7 +143,7 @@ class Feed:
         over: the list has these only once a later step is decided. The state cannot show that, since it may
         be newer than the steps.
         """
-        return end if len(new.steps) == KEPT else max(end, rules.begins(self.rules[-1]))
+        return end if len(new.steps) == KEPT else max(end, self.rules[-1].begins)
 
     def outdated(self, new: News) -> bool:
         """Whether the session has had a switch that this feed does not know; its rows may be wider now."""
@@ -157,7 +157,7 @@ class Feed:
         return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
 
 
-def ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
+def ruled(session: Session) -> tuple[Sequence[Rule], list[dict[str, Any]], int]:
     """The members `rules`, `told` and `width` of a `Feed`."""
     told = describe(session.rules, session.state)["rules"]
     return session.rules, told, 8 * session.rows.shape[1]
