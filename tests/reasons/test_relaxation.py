@@ -5,7 +5,11 @@ from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
+from specshield.handover import begun
+from specshield.policy.planner.policy import Settings as Plan
+from specshield.policy.planner.policy import synthesise as synthesise_plans
 from specshield.episode import decide, make_shield
 from specshield.episode.handover import begun
 from specshield.policy.reachability.policy import synthesise
@@ -15,7 +19,7 @@ from specshield.reasons.relaxation import relaxations, way
 from specshield.robot import robot_from_json
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
-from tests.oracles.cells import Scripted, waits
+from tests.oracles.cells import CELL, Cells, Scripted, waits
 from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
@@ -72,6 +76,36 @@ def test_how_late_an_until_and_a_place_to_be_in_come():
                 assert rule(at + told.late_by).feasible(history).any()
                 assert not rule(at + told.late_by - 1).feasible(history).any()
     assert seen >= 4
+
+
+@pytest.mark.parametrize(
+    ("part", "keeps"),
+    [
+        (
+            "G[0,4] (F[0,3] A or F[0,3] C)",
+            lambda s: np.all([(s["A"] | s["C"])[..., k : k + 4].any(-1) for k in range(5)], axis=0),
+        ),
+        (
+            "F[0,3] (A and F[1,2] not A)",
+            lambda s: np.any(
+                [s["A"][..., k] & ~s["A"][..., k + 1 : k + 3].all(-1) for k in range(4)], axis=0
+            ),
+        ),
+    ],
+)
+def test_a_part_that_a_policy_can_keep_alone_is_not_blamed_for_another(part, keeps):
+    """The search knows neither form of rule. C is 8 cells away, more than the other part's window allows."""
+    places, rule = {name: PLACES[name] for name in "AC"}, f"{part} and F[0,3] C"
+    alone, whole = Cells(part, keeps, places), Cells(rule, None, places)
+    planned = make_shield([synthesise_plans(whole.task, Plan(pitch=CELL))])
+    expected = set()
+    for heading in range(4):
+        history = np.array([whole.pose(0, 0, heading)])
+        blamed, other = relaxations(planned, history, {}).conjuncts
+        expected.add(bool(alone.feasible(history).any()))
+        assert blamed.feasible_alone == bool(alone.feasible(history).any())
+        assert not other.feasible_alone
+    assert expected == {True, False}
 
 
 def shield(parts):

@@ -24,6 +24,7 @@ from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import futures, prefix_of
+from specshield.shield.proposal import adapted
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
 MOST_LATE = 150  # [steps] the most by which a window is tried to end later. Chosen by hand
@@ -137,7 +138,8 @@ def _late(part: Formula, samples: Mapping[str, Floats], now: int) -> float:
 
 def _gather(gathered: _Gathered) -> None:
     """Judges the policies' futures, then, as far as these leave it open, searches for the whole rule, for
-    each conjunct alone, and for all of them while one may be late or is left out.
+    each conjunct alone, which the policies are asked for too, and for all of them while one may be late or is
+    left out.
     """
     shield, known, parts = gathered.shield, gathered.known, gathered.parts
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
@@ -156,12 +158,17 @@ def _gather(gathered: _Gathered) -> None:
     if gathered.way is not None:
         return
     some = range(min(len(parts), MOST_CONJUNCTS))
+    able = [policy for policy in shield.proposers if hasattr(policy, "giving_up")]
     each = [reader.alternatives(parts[i]) for i in some]
     driven = shield.task.samples(known.history, known.signals)
     timed = [later(parts[i], 1) is not None and may_be_late(parts[i], driven, known.now) for i in some]
     for i in some:
         if not gathered.kept(i):
             look_for(each[i])
+        others = tuple(part for part in parts if part != parts[i])
+        if able and others and prefix.steps > 0 and not gathered.kept(i):  # a search misses some rules
+            asked = [adapted(policy, "giving_up", others) for policy in able]
+            gathered.judge(futures(prefix, shield.body, asked, None, (0.0,)).motions)
         if not gathered.kept(i) and timed[i]:
             look_for(each[i], each[i])
     if len(parts) > 1 and all(gathered.kept(i) for i in range(len(parts))):

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
+from specshield.arrays import Floats, Int32s
 from specshield.arrays import Codes, Floats, Int32s
 from specshield.caution.residual import all_of
 from specshield.caution.surprise.barred import NOTHING_BARRED
@@ -32,10 +33,11 @@ from specshield.policy.extent import COARSEST, fitting_pitch
 from specshield.policy.lattice import INVALID, STEP_CODES, headings_of, make_lattice, number_cells, side_of
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.planner.due_dates import cost_of, foresee, is_open_if, make_bounds
-from specshield.policy.planner.fields import OUT_OF_REACH, Fields, holding, steps_to
+from specshield.policy.planner.due_dates import cost_of
+from specshield.policy.planner.fields import OUT_OF_REACH, Fields
 from specshield.policy.planner.first_motions import plan_all
-from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
+from specshield.policy.planner.leads import MAX_ENTRIES, MAX_FIELDS, make_fields
+from specshield.policy.planner.literals import leading, literals_of, released
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.progress import residuals
@@ -43,16 +45,17 @@ from specshield.policy.reachability.stored import check_fit
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.policy.undo import turning_motion
 from specshield.reasons.still_open import bounds_after, still_open
+from specshield.robot.barred import NOTHING_BARRED
+from specshield.robot.dynamics import Body, calmest_motion
+from specshield.rule.residual import all_of
 from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look
 from specshield.shield.proposal import Proposal
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Not, Or, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.task import Task
+from specshield.world.occupancy import OccupancyGrid
 
-MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
-MAX_FIELDS = 32  # further literals have no field, so no plan goes to where they hold
-NEAREST = 1.0  # [steps] more than the fewest to an answer still count as the fewest; chosen by hand
 USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effort of the settings
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
@@ -70,7 +73,8 @@ class PlannerPolicy(Carded):
     keeps what has to hold for a while; -1 for none. If another part asks for what begins a response, the
     same again, but with fields that lead there to where the answer is nearest. foreseen [S]: the values of
     the signals from x_{t+1} on; None: their last values. share: of the effort that the settings allow. rest:
-    the formula that is planned for if parts are given up.
+    the formula that is planned for if parts are given up. again: the same with fields for another map, see
+    `remade`.
     """
 
     settings: Settings
@@ -79,14 +83,25 @@ class PlannerPolicy(Carded):
     foreseen: Floats | None = None
     share: float = 1.0
     rest: Formula | None = None
+    again: PlannerPolicy | None = None
 
     @cached_property
     def _world(self) -> World:
         return self._world_of(self.task.formula)
 
     def on_body(self, body: Body, guess: bool = False) -> PlannerPolicy:
-        """The policy on another map: its fields stay the same, its ways are simulated on that map."""
-        return replace(self, share=GUESSED if guess else 1.0)._in(self._world._replace(body=body))
+        """The policy on another map, on which its ways are simulated: with the newest fields that there are.
+
+        guess: whether the map is one of several that are tried in one decision. It has fewer obstacles than
+        what was learned, for which the newest fields are, so its fields are those of the policy's own map.
+        """
+        policy = self if guess or self.again is None else self.again
+        return replace(policy, share=GUESSED if guess else 1.0)._in(policy._world._replace(body=body))
+
+    def remade(self, grid: OccupancyGrid) -> PlannerPolicy:
+        """The policy, which has fields for another map of the same size beside its own from now on."""
+        fields, chosen = make_fields(replace(self.task, grid=grid), self.fields.pitch)
+        return replace(self, again=replace(self, fields=fields, chosen=chosen, again=None))
 
     def briefly(self) -> PlannerPolicy:
         """The policy with less effort a plan, for explanations, which ask it often."""
@@ -235,44 +250,9 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
         run.on_progress(done, (time.perf_counter() - began) * (1.0 - done) / done, "")
 
     pitch = _pitch(task, settings)
-    packed, literals = literals_of(task, task.formula)
-    lattice = make_lattice(make_body(task.robot, task.grid), pitch)
-    (holds, near), free = holding(task, lattice, literals), lattice.valid == 1
-    used = free.any(axis=2)
-    codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
-    chosen = np.full((len(literals), 2), -1, np.int32)
-    for column, kept in enumerate(_kept(task, packed, literals)):
-        for k in range(len(literals)):
-            keeps = tuple(g for g in kept if literals[g].predicate != literals[k].predicate)
-            if (k, keeps) not in codes and len(codes) < MAX_FIELDS:
-                allowed = free.copy()
-                for g in keeps:  # the left of an `until` need not hold where the right does
-                    ended = (literals[k].predicate, literals[k].side) in literals[g].ends
-                    allowed &= holds[g] | near[k] if ended else holds[g]
-                codes[k, keeps] = steps_to(lattice, near[k], allowed)[used]
-            chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
-            tell(FIELDS_SHARE * (column * len(literals) + k + 1) / (2 * len(literals)))
-    made, prompt = list(codes.values()), chosen.copy()
-    index = {each[:2]: k for k, each in enumerate(literals)}
-    most = min(MAX_FIELDS, MAX_ENTRIES // (int(used.sum()) * free.shape[2] or 1))
-    for part in conjuncts(task.formula):
-        match part:
-            case Always(_, _, Implies(p, Eventually(_, _, q)) | Or((Not(p), Eventually(_, _, q)))):
-                k, answer = (index.get((each, 1), -1) for each in (p, q))
-                if min(k, answer) >= 0 and prompt[k, 0] == chosen[k, 0] and len(made) < most:
-                    own, left = (made[f] for f in chosen[[k, answer], 0])
-                    goal, keeps = np.zeros((2, *free.shape), np.bool_)
-                    keeps[used] = own != INVALID
-                    here = near[k][used] & keeps[used]
-                    goal[used] = here & (left <= left[here].min(initial=INVALID) + NEAREST * STEP_CODES)
-                    prompt[k] = len(made)
-                    allowed = keeps & (goal | ~near[k])  # the response begins at the way's end, not before
-                    made.append(steps_to(lattice, goal, allowed)[used])
-    chosen = np.hstack([chosen, prompt]) if len(made) > len(codes) else chosen
-    cell = number_cells(used)
-    code = np.array(made, np.uint16).reshape(len(made), int(used.sum()), free.shape[2])
+    fields, chosen = make_fields(task, pitch, lambda done: tell(FIELDS_SHARE * done))
     # Trying it also leaves its kernels compiled where a server finds them.
-    policy = PlannerPolicy(task, {}, settings, Fields(cell, code, pitch), chosen)
+    policy = PlannerPolicy(task, {}, settings, fields, chosen)
     share = policy.feasible_start(on_progress=lambda done: tell(FIELDS_SHARE + (1.0 - FIELDS_SHARE) * done))
     metrics = {"feasible_start": round(share, 4)}
     if task.signals:
@@ -280,8 +260,8 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
         share = policy.feasible_start(at_worst) if at_worst else 0.0
         metrics["feasible_start_any_signal"] = round(share, 4)
-    size, took = int(code.nbytes + cell.nbytes), round(time.perf_counter() - began, 3)
-    metrics |= {"fields": len(made), "size_bytes": size, "wall_time_s": took}
+    size, took = int(fields.code.nbytes + fields.cell.nbytes), round(time.perf_counter() - began, 3)
+    metrics |= {"fields": len(fields.code), "size_bytes": size, "wall_time_s": took}
     return replace(policy, card=make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec))
 
 
@@ -317,21 +297,3 @@ def _pitch(task: Task, settings: Settings) -> float:
         would = f"options.pitch {least:.2f} or more, or fewer predicates"
         raise PolicyError("the fields are too large", path="options.pitch", got=got, expected=would)
     return pitch
-
-
-def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
-    """The literals that every way to a goal keeps; and these with those that may have to hold for a while.
-    The former have to hold, whatever else happens, at half of all steps or more.
-    """
-    tree = packed.formula.tree
-    bounds = make_bounds(tree.size)
-    foresee(packed, -1, np.empty(tree.size), np.zeros(len(packed.leaf)), bounds)
-    for n in np.flatnonzero(packed.leaf[:, 0] < 0):  # the signals may be anything
-        span = slice(tree.leaf_at[n], tree.leaf_at[n] + tree.leaf_stop[n] - tree.leaf_start[n])
-        bounds.low[span], bounds.high[span] = -np.inf, np.inf
-    always = []
-    for k in range(len(literals)):
-        needed = [not is_open_if(packed, k, -1, -1, t, t, bounds) for t in range(task.horizon + 1)]
-        if 2 * sum(needed) >= len(needed):
-            always.append(k)
-    return always, [k for k in range(len(literals)) if k in always or literals[k].guards]

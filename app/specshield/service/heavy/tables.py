@@ -1,19 +1,19 @@
-"""Tables of policies for the maps that sessions learn. They are made in the background.
+"""Tables of policies, and fields of planners, for the maps that sessions learn. Made in the background.
 
-Until a session's tables are ready, and for changes of its map since then, ways around are searched for
-(reachability/around/). A decision's record has the digest of the map that its tables were made for, so that
-the decision can be made again.
+Until a session's tables are ready, and for changes of its map since then, policies search for ways around. A
+decision's record has the digest of the map that its tables were made for, so that the decision can be made
+again.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import NamedTuple
 
 from specshield.errors import SpecshieldError
-from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.service.heavy.background import Background
 from specshield.service.library import files
 from specshield.shield.decision import Shield
@@ -50,7 +50,7 @@ class Tables:
 
         session: its nonce, since its id may belong to other owners or to a later session too.
         """
-        if not len(known) or not any(isinstance(each, ReachabilityPolicy) for each in shield.proposers):
+        if not len(known) or not any(hasattr(each, "remade") for each in shield.proposers):
             return shield, None
         making = self._making.peek(session)
         if making is not None and making.done():
@@ -78,10 +78,11 @@ def make(shield: Shield, known: LearnedMap) -> Made:
 
 def _remade(proposer: Proposer, grid: OccupancyGrid) -> Proposer:
     """The policy with tables for this map, or unchanged if it has none or they cannot be made."""
-    if not isinstance(proposer, ReachabilityPolicy):
+    remade: Callable[[OccupancyGrid], Proposer] | None = getattr(proposer, "remade", None)
+    if remade is None:
         return proposer
     try:
-        return proposer.remade(grid)
+        return remade(grid)
     except SpecshieldError as error:
         log.warning("policy %s keeps its tables on a session's own map: %s", proposer.id, error)
         return proposer
