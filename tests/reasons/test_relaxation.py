@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from specshield.handover import begun
-from specshield.policy.planner.policy import Settings as Plan
-from specshield.policy.planner.policy import synthesise as synthesise_plans
 from specshield.episode import decide, make_shield
 from specshield.episode.handover import begun
+from specshield.policy.planner.policy import Settings as Plan
+from specshield.policy.planner.policy import synthesise as synthesise_plans
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.lateness import driven
 from specshield.reasons.refusal import begin, refusal

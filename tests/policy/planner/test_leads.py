@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from specshield.caution.taught import Taught
+from specshield.episode import Config, decide, make_shield
 from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import step
 from specshield.service.heavy.tables import make
-from specshield.shield.episode import Config, decide, make_shield
-from specshield.shield.taught import Taught
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

@@ -21,7 +21,6 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Floats, Int32s
-from specshield.arrays import Codes, Floats, Int32s
 from specshield.caution.residual import all_of
 from specshield.caution.surprise.barred import NOTHING_BARRED
 from specshield.caution.worst import moved, worst_signals
@@ -30,7 +29,7 @@ from specshield.errors import MapError, PolicyError
 from specshield.policy.card import Card, Carded, joined, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import INVALID, STEP_CODES, headings_of, make_lattice, number_cells, side_of
+from specshield.policy.lattice import headings_of, side_of
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import cost_of
@@ -45,10 +44,7 @@ from specshield.policy.reachability.stored import check_fit
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.policy.undo import turning_motion
 from specshield.reasons.still_open import bounds_after, still_open
-from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion
-from specshield.rule.residual import all_of
-from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look
 from specshield.shield.proposal import Proposal

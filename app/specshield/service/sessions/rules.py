@@ -15,14 +15,13 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.episode import handover
 from specshield.service.library import files
 from specshield.service.library.policies import Description
 from specshield.service.schemas.sessions import KnownUncertainty, SessionRequest
 from specshield.shield.decision import Carry, Config
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task
-from specshield.episode import handover
-from specshield.shield.decision import Carry
 
 MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines
 Told = Literal["learned", "none"] | dict[str, float]

@@ -26,8 +26,6 @@ from specshield.service.sessions.record import Asked, StepRecord
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record, shown
-from specshield.shield import episode
-from specshield.service.storage.store import Dump, Record
 from specshield.shield.decision import Carry, Config, Decision, Shield
 
 F = TypeVar("F")

@@ -49,8 +49,6 @@ from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.store import Change, Limit, exists, no_more, scoped
-from specshield.shield import episode
-from specshield.service.storage.store import Change, Limit, exists, no_more
 from specshield.shield.decision import USUAL_STEPS, Config, check_preferring
 from specshield.shield.preference import Preference
 from specshield.world.learned import LearnedMap

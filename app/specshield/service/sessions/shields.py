@@ -26,7 +26,6 @@ from specshield.service.sessions import record, rules
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session
 from specshield.service.settings import Settings
-from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
