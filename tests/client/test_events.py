@@ -159,10 +159,10 @@ def test_a_watched_session_is_headed_with_the_rule_of_the_decisions_that_follow(
         body = b"".join(told(t) for t in steps if t < 4) + switch + told(4, 5) + END
         return httpx.Response(200, content=body, headers={"content-type": "text/event-stream"})
 
-    def client(url, api_key):
-        return ShieldClient(url, api_key, transport=httpx.MockTransport(serve))
+    def client(url, api_key, timeout):
+        return ShieldClient(url, api_key, timeout, transport=httpx.MockTransport(serve))
 
-    monkeypatch.setattr("specshield.client.ShieldClient", client)
+    monkeypatch.setattr("specshield.commands.serving.ShieldClient", client)
     shown = []
     for after in (-1, 1):
         watched("s", "http://robot.test", after, None)
