@@ -57,6 +57,7 @@ class Settings(BaseSettings):
     max_body_bytes: int = Field(1 << 20, ge=1024)  # largest request body
     max_upload_bytes: int = Field(64 << 20, ge=1024)  # largest map or policy sent
     max_bodies_bytes: int = Field(128 << 20, ge=1 << 20)  # most for all bodies that are being received
+    max_body_members: int = Field(10_000, ge=100)  # most members of objects in a JSON body, uploads excepted
     # Largest spec of a policy, and largest outlines of a map's rooms, as JSON.
     max_spec_bytes: int = Field(256 << 10, ge=1024)
     max_header_bytes: int = Field(32 << 10, ge=1024)  # largest head of a request

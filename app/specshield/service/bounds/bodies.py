@@ -29,7 +29,6 @@ LONG = ("/steps", "/close", "/switch", "/validate")  # bodies with a history, or
 FREE = 64 << 10  # [bytes] of each body that the budget does not count, so that steps are always taken
 IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they are written to its file
 LONG_JSON = 16 << 10  # [bytes]; a shorter body has no room for many members
-MEMBERS = 10_000  # of all objects in a body that is no upload, at most; chosen by hand
 
 
 class Budget:
@@ -128,7 +127,7 @@ class Bodies:
                     scope["state"]["status"] = CLIENT_GONE
                     return
                 if not upload:
-                    _check_members(body.content)
+                    _check_members(body.content, self._settings.max_body_members)
             except SpecshieldError as error:
                 # The rest of the body is not read.
                 await problems.ProblemResponse(error, {"Connection": "close"})(scope, receive, send)
@@ -197,14 +196,14 @@ def clear(folder: Path) -> None:
                 path.unlink()
 
 
-def _check_members(content: bytes | Path) -> None:
+def _check_members(content: bytes | Path, most: int) -> None:
     """Raises InputError for too many members: a schema makes an error for each unknown one."""
-    if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > MEMBERS:
+    if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > most:
         raise InputError(
             "the body has too many members",
             path="body",
             got=content.count(b":"),
-            expected=f"at most {MEMBERS}, where colons in texts count too",
+            expected=f"at most {most}, where colons in texts count too",
         )
 
 
