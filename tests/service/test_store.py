@@ -16,7 +16,7 @@ import redis
 from specshield.errors import StoreError
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.store import Change, Record, Store, keys
+from specshield.service.storage.store import INDEX, Change, Record, Store, keys
 from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
 from tests.serving import children, runs, serving, wait_for
 
@@ -267,6 +267,30 @@ def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name
 
     try:
         asyncio.run(scene())
+    finally:
+        own.leave()
+
+
+def test_a_list_of_names_is_swept_once_for_all_who_wait_for_room(tmp_path):
+    own = EmbeddedStore(tmp_path)
+    own.join()
+
+    async def scene():
+        store = Store(own.url, timeout=5.0, ttl=60)
+        await store.create("ann@here", b"config", Change(b"state", bytes(24)))
+        await store.redis.zadd(INDEX, {f"ann@gone{i}": 0 for i in range(5)})
+        await store.redis.config_resetstat()
+        await asyncio.gather(*(store.sweep("ann") for _ in range(20)))
+        read = (await store.redis.info("commandstats"))["cmdstat_zrangebylex"]["calls"]
+        assert await store.count("ann") == 1
+        await store.redis.zadd(INDEX, {"ann@later": 0})
+        await store.sweep("ann")  # nobody else is at it, so this one looks for itself
+        assert await store.count("ann") == 1
+        await store.aclose()
+        return read
+
+    try:
+        assert asyncio.run(scene()) <= 4  # two sweeps, each of which reads until there is no more
     finally:
         own.leave()
 

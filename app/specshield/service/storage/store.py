@@ -11,6 +11,8 @@ one owner stand together; it may still name sessions that have expired.
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -99,6 +101,7 @@ class Store:
         if not self._in_cluster:
             self._wire = Wire(self.redis.connection_pool.make_connection, timeout, replicas)
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
+        self._sweeping, self._swept = asyncio.Lock(), dict[str | None, float]()
 
     async def aclose(self) -> None:
         self._wire.close()
@@ -194,7 +197,18 @@ class Store:
             return int(await self.redis.zlexcount(INDEX, low, high))
 
     async def sweep(self, owner: str | None) -> None:
-        """Takes the names of expired sessions off the list, for an owner or for None all owners."""
+        """Takes the names of expired sessions off the list, for an owner or for None all owners.
+
+        With many names that takes seconds, so it is done once for all who ask while another one is at it.
+        """
+        asked = time.monotonic()
+        async with self._sweeping:
+            if self._swept.get(owner, -math.inf) < asked:
+                began = time.monotonic()
+                await self._sweep(owner)
+                self._swept[owner] = began
+
+    async def _sweep(self, owner: str | None) -> None:
         low, high = _range(owner)
         while True:
             async with self._reaching():
