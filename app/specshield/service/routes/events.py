@@ -103,7 +103,8 @@ async def events(
     responses={
         200: {
             "content": {chain.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
-            "description": "A file for `specshield verify`. `X-Record-Seal` is its seal.",
+            "description": "A file for `specshield verify`.",
+            "headers": {"X-Record-Seal": {"description": "The record's seal.", "schema": {"type": "string"}}},
         },
         **problems(**GONE),
     },
