@@ -53,8 +53,8 @@ def _lines(figures: Figures, race: Figures | None) -> Iterator[str]:
         f"- **(b)** {NAMES['b']}: the 7 distinct motions as one batch through torch and NumPy; specshield's "
         "vectorised robustness instead of rtamt."
     )
-    yield f"- **(c)** {NAMES['c']}: `shield.episode.decide`."
-    yield f"- **(d)** {NAMES['d']}: `shield.episode.decide`."
+    yield f"- **(c)** {NAMES['c']}: `episode.decide`."
+    yield f"- **(d)** {NAMES['d']}: `episode.decide`."
     yield ""
     yield (
         "(a) and (b) decide fewer states; their ratios to (c) and (d) are medians over the states that all "

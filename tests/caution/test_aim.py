@@ -1,4 +1,4 @@
-"""Margin and slack, worked out by hand on cells of 0.2 m (tests/shield/test_episode.py has the map)."""
+"""Margin and slack, worked out by hand on cells of 0.2 m (tests/episode/test_algorithm.py has the map)."""
 
 from collections import Counter
 

@@ -12,6 +12,7 @@ The robot starts in the lower left corner looking east; A is the cell ahead of i
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -659,3 +660,29 @@ def test_several_policies_certify_together():
     assert decide(make_shield([goes]), [START], EVEN).j_values[:MOTIONS] == (1.0, 0.0, 0.0, 1.0)
     assert decide(make_shield([comes_back]), [START], EVEN).j_values[:MOTIONS] == (1.0, 1.0, 0.0, 0.0)
     assert decide(make_shield([goes, comes_back]), [START], EVEN).j_values[:MOTIONS] == (1.0, 1.0, 0.0, 1.0)
+
+
+class Meddler:
+    """A preference that writes into what it is given, and returns these weights."""
+
+    def __init__(self, weights):
+        self.weights = weights
+
+    def begin(self):
+        return b""
+
+    def step(self, memory, history, signals, log_prior, feasible):
+        history[:], log_prior[:], feasible[:] = 0.0, 0.0, True
+        return b"", self.weights
+
+
+@pytest.mark.parametrize("weights", [np.zeros(5), np.full(5, np.nan), np.array([0, np.inf, 0, 0, 0.0]), None])
+def test_no_preference_makes_an_action_feasible(weights):
+    plain = make_shield([Scripted(REACH, waits)])
+    history, logits = np.array([REACH.pose(0, 0, 0)]), np.zeros(5)
+    usual = decide(plain, history, logits)
+    found = decide(replace(plain, preference=Meddler(weights)), history, logits)
+    assert 0.0 in usual.distribution
+    assert found.distribution.tolist() == usual.distribution.tolist()
+    fit = weights is not None and bool(np.all(weights < np.inf))
+    assert any("weights" in said for said in found.warnings) is not fit

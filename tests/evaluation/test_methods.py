@@ -1,4 +1,4 @@
-"""Methods on cells of 0.2 m, worked out by hand (tests/shield/test_episode.py has the map)."""
+"""Methods on cells of 0.2 m, worked out by hand (tests/episode/test_algorithm.py has the map)."""
 
 import math
 

@@ -10,10 +10,14 @@ from specshield.world.learned import LearnedMap
 from tests.serving import wait_for
 
 
-def test_a_session_goes_on_without_tables_that_cannot_be_made():
+def test_a_session_goes_on_without_tables_that_cannot_be_made_and_does_not_try_again_for_the_same_map():
     shield, tables = make_shield([shipped(load_case("case1"), "reachability")]), Tables()
     nowhere = np.array([shield.task.grid.occupied.size])  # no cell of the map
-    known = LearnedMap(1, nowhere, np.array([True]), np.array([0]), np.array([0]))
-    for _ in range(2):
+    for cells in (nowhere, nowhere + 1):
+        known = LearnedMap(1, cells, np.array([True]), np.array([0]), np.array([0]))
         assert tables.of("a session", shield, known) == (shield, None)
-        wait_for(tables._making.peek("a session").done)
+        _, making = tables._making.peek("a session")
+        wait_for(making.done)
+        for _ in range(2):
+            assert tables.of("a session", shield, known) == (shield, None)
+            assert tables._making.peek("a session") is None

@@ -89,7 +89,11 @@ def test_futures_that_were_judged_by_another_formula_are_judged_again(other):
 
 
 def test_a_completion_that_is_not_certified_gives_way_to_one_that_is():
-    assert certified(claim(completion=WAIT))[0].completion in FEASIBLE
+    for completion in (WAIT, END):
+        assert certified(claim(completion=completion))[0].completion in FEASIBLE
+    last = claim(tried(PREFIX.of(parse("F[0,3] not A"))), completion=END)  # here the last motion is certified
+    prefix = last.tried.prefix
+    assert certify(SHIELD, SHIELD.body, prefix, last).completion != END
     assert certified(claim(motions=NONE, completion=WAIT))[0].completion == WAIT  # nothing is: it is the best
 
 

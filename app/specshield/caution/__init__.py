@@ -1,1 +1,1 @@
-"""What J asks for beyond satisfaction, and how a session learns how much of it the robot needs."""
+"""Which futures are tried, what J asks for beyond satisfaction, what a session learns of robot and map."""

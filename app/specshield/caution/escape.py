@@ -19,7 +19,7 @@ from specshield.shield.feasibility import Futures, Prefix, simulated
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
 
-# Chosen by hand, so that one search costs some milliseconds; tests/shield/test_escape.py says what is found.
+# Chosen by hand, so that one search costs some milliseconds; tests/caution/test_escape.py says what is found.
 POSES_A_LAYER = 1024  # poses that are simulated at each step of the search, about
 LONGEST_ESCAPE = 24  # [steps] ways out that take longer are not searched for
 ESCAPES = 4  # ways out that are continued to the horizon: each of them asks every proposer

@@ -153,8 +153,12 @@ def decide(
         certified = certify(shield, body, judged.part if spec_status == "violated" else whole, judged.claim)
         said = (*said, *certified.warnings)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
-            known = shield.preference.begin() if memory is None else memory
-            memory, weights = shield.preference.step(known, poses, signals, log_prior, certified.feasible)
+            memory, weights = _preferred(shield, memory, poses, signals, log_prior, certified.feasible)
+            if weights is None:
+                said = (
+                    *said,
+                    "the preference's weights are not numbers, one for each action: it is left out",
+                )
         if shield.config.threshold_over == "episode" and spec_status == "pending":
             chance = chances(shield, care, prefix, judged, doubts)
             left = left_of(shield, carry, chance)
@@ -219,6 +223,22 @@ def decide(
     )
 
 
+def _preferred(
+    shield: Shield, memory: bytes | None, poses: Floats, signals: Signals, log_prior: Floats, feasible: Bools
+) -> tuple[bytes | None, Floats | None]:
+    """What the session's preference remembers, and its weights [A]; None for weights that are not such. It is
+    given copies: nothing that it does can make an action feasible.
+    """
+    assert shield.preference is not None
+    known = shield.preference.begin() if memory is None else memory
+    memory, weights = shield.preference.step(known, poses.copy(), signals, log_prior.copy(), feasible.copy())
+    # NaN is not below infinity either.
+    fit = (
+        isinstance(weights, np.ndarray) and weights.shape == feasible.shape and bool((weights < np.inf).all())
+    )
+    return memory, weights if fit else None
+
+
 def _history(poses: ArrayLike, path: str = "poses") -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64, order="C")
@@ -261,6 +281,7 @@ def _follow(
     off = _gaps(carry.next_poses, poses[carry.t + 1], gap)
     reach, gaps = sum(off) + SAME_POSE, gap.tolist()
     ways = [w for w, far in zip(carry.witnesses, gaps, strict=True) if w and far <= reach]
+    ways = [w for w in ways if max(w) < len(body.translate)]
     if alone > 0 and len(ways) > 1:  # a blocked move leads where waiting does
         ends = np.empty((len(ways), alone, 3))
         for w, end in zip(ways, ends, strict=True):

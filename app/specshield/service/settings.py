@@ -71,7 +71,7 @@ class Settings(BaseSettings):
 
     max_owner_bytes: AnyCount = 8 << 30  # most that one key's maps and policies take on the disk
     max_stored_bytes: AnyCount = 32 << 30  # most that all maps and policies take on the disk
-    disk_reserve_bytes: AnyCount = 64 << 20  # of the data folder's disk, which only running sessions use up
+    disk_reserve_bytes: AnyCount = 64 << 20  # of its disk, free for running sessions
     max_maps: Count = 1000  # most uploaded maps kept
     max_policies: Count = 1000  # most policies kept
     max_sessions: Count = 100_000  # most sessions in the store; those in the archive do not count

@@ -77,7 +77,8 @@ def certify(shield: Shield, body: Body, prefix: Prefix, claim: Claim) -> Certifi
     if shield.config.evaluation == "robustness":
         best = best_of(tried.motions, rho, len(held)).robustness
         values = np.minimum(values, np.where(robot.motion_of >= 0, best[robot.motion_of], -np.inf))
-    if True in held and not held[robot.motion_of[completion]]:
+    motion = robot.motion_of[completion]
+    if True in held and (motion < 0 or not held[motion]):
         shown = np.where(holds, rho.take(claim.row, mode="clip"), -np.inf)
         completion = int(robot.representative[np.argmax(shown)])
     witnesses = tuple([content[m * n : m * n + n] if ok else None for m, ok in enumerate(held)])

@@ -92,7 +92,7 @@ class Futures(NamedTuple):
     of each future joined to the prefix; -inf if its simulation was given up. leaves [N, size]: the values of
     the formula's leaves along each future that was not given up. preferred: the motion that the first
     proposer would make itself. warnings: which proposers were not used and why. prefix, body: what they were
-    simulated and judged with. Only `simulated` and `together` make such futures.
+    simulated and judged with. Only `simulated` and `together` write such arrays.
     """
 
     motions: Ints

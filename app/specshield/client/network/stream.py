@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import httpx
 
 from specshield.client.network.bounded import in_thread, is_direct
-from specshield.client.network.transport import STALE, Exchange
+from specshield.client.network.transport import MINE, STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
 
@@ -127,7 +127,9 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
     if answer is None:
         return exchange.failure(httpx.ReadError(str(error)))
     exchange.content += answer.body or b""
-    return exchange.reply(answer.status_code, dict(answer.headers.raw_items()))
+    # The handshake sends no id of its own, so any that came back is another's invention.
+    headers = {name: value for name, value in answer.headers.raw_items() if name.lower() != MINE.lower()}
+    return exchange.reply(answer.status_code, headers)
 
 
 class SyncStreams(Streams):

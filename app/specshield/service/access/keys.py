@@ -130,7 +130,7 @@ class Keys:
         while True:
             try:
                 await self.refresh()
-            except Exception:  # the next one may succeed; without them no revoked key would be refused
+            except Exception:  # the next one may succeed; without a next one no revoked key is refused
                 log.exception("the keys cannot be read")
             await asyncio.sleep(REFRESH)
 
@@ -138,8 +138,8 @@ class Keys:
 
     async def listed(self) -> list[Key]:
         found = await _reached(self._store.hgetall(KEYS))
-        keys = [msgspec.json.decode(record, type=Key) for name, record in found.items() if name]
-        return sorted(keys, key=lambda key: key.name)
+        keys = (_read(name, record) for name, record in found.items() if name)
+        return sorted((key for key in keys if key is not None), key=lambda key: key.name)
 
     async def create(self, name: str, **limits: Any) -> str:
         """Makes a key and returns it: it cannot be read again. Raises InputError and LimitReached."""
@@ -188,6 +188,15 @@ class Rates:
 
 
 OPEN = Key("", "")  # stands for all callers of a server that asks for no key
+
+
+def _read(name: bytes, record: bytes) -> Key | None:
+    """The key of a record. None, and a line in the log, for one that cannot be read: it opens nothing."""
+    try:
+        return msgspec.json.decode(record, type=Key)
+    except msgspec.MsgspecError as error:
+        log.error("the record of the key %r cannot be read, so it opens nothing: %s", name.decode(), error)
+        return None
 
 
 def digest_of(key: bytes) -> str:

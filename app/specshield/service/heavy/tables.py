@@ -22,7 +22,7 @@ from specshield.world.learned import LearnedMap, applied
 from specshield.world.occupancy import OccupancyGrid
 
 log = logging.getLogger("specshield")
-ROOM = 64  # sessions whose tables are kept, about a megabyte each. Chosen by hand.
+ROOM = 64  # sessions whose tables are kept: about a megabyte each, more for a planner's fields. By hand.
 
 
 class Made(NamedTuple):
@@ -42,7 +42,8 @@ class Tables:
 
     def __init__(self) -> None:
         self._threads = Background("tables")
-        self._newest, self._making = files.Recent[Made](ROOM), files.Recent[Future[Made]](ROOM)
+        self._newest, self._making = files.Recent[Made](ROOM), files.Recent[tuple[bytes, Future[Made]]](ROOM)
+        self._failed = files.Recent[bytes](ROOM)  # the digest of the map for which no tables could be made
 
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
         """The shield with the newest tables of the session, and their digest, None if it has none yet. Also
@@ -53,18 +54,20 @@ class Tables:
         if not len(known) or not any(hasattr(each, "remade") for each in shield.proposers):
             return shield, None
         making = self._making.peek(session)
-        if making is not None and making.done():
+        if making is not None and making[1].done():
             self._making.drop(session)
-            if (error := making.exception()) is None:
-                self._newest.put(session, making.result())
+            if (error := making[1].exception()) is None:
+                self._newest.put(session, making[1].result())
             else:  # the session goes on without them, as before they were made
+                self._failed.put(session, making[0])
                 log.warning("tables for a session's own map cannot be made: %r", error)
             making = None
         newest = self._newest.peek(session)
         if newest is not None and newest.policies != _ids(shield):  # they are of an earlier rule
             newest = None
-        if making is None and (newest is None or newest.digest != known.digest):
-            self._making.get(session, lambda: self._threads.submit(make, shield, known))
+        have = self._failed.peek(session), None if newest is None else newest.digest
+        if making is None and known.digest not in have:
+            self._making.get(session, lambda: (known.digest, self._threads.submit(make, shield, known)))
         if newest is None:
             return shield, None
         return replace(shield, proposers=newest.proposers), newest.digest
