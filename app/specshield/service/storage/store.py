@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import defaultdict
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -101,7 +102,8 @@ class Store:
         if not self._in_cluster:
             self._wire = Wire(self.redis.connection_pool.make_connection, timeout, replicas)
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
-        self._sweeping, self._swept = asyncio.Lock(), dict[str | None, float]()
+        self._sweeping = defaultdict[str | None, asyncio.Lock](asyncio.Lock)
+        self._swept = dict[str | None, float]()
 
     async def aclose(self) -> None:
         self._wire.close()
@@ -202,7 +204,7 @@ class Store:
         With many names that takes seconds, so it is done once for all who ask while another one is at it.
         """
         asked = time.monotonic()
-        async with self._sweeping:
+        async with self._sweeping[owner]:
             if self._swept.get(owner, -math.inf) < asked:
                 began = time.monotonic()
                 await self._sweep(owner)
