@@ -5,7 +5,7 @@ V(a) is a lower bound on the probability of keeping the rule after a, V* the lar
     pi_t = the distribution nearest to the model's with E_pi[V] >= d_t,    d_{t+1} = d_t V*_{t+1} / E_pi_t[V].
 
 If V(a) is never above the expected V* of the next step, then E[d_{t+1}] >= d_t, and d_t <= V*_t; so the rule
-is kept with probability delta or more. In an exact world V is J, 0 or 1.
+is kept with probability delta or more. In an exact world, without margin and slack, V is J, 0 or 1.
 
 If motions differ from f, V(a) is the probability that the best future after a withstands slips and noise
 (docs/uncertainty.md): a lower bound with slips alone, an estimate with noise.
