@@ -2,7 +2,7 @@
 
 (a) `one_by_one`: each action's rollout by itself, all 19 that do not end, and rtamt on each trajectory.
 (b) `batched`: the 7 distinct motions as one batch through torch and NumPy, and our vectorised robustness.
-Both see what the shipped DQN sees (policy/observation.py), computed here in NumPy.
+Both see what the shipped DQN sees (policy/dqn/observation.py), computed here in NumPy.
 """
 
 from __future__ import annotations

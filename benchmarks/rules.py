@@ -6,7 +6,7 @@ Episodes of the goal-seeking model behind the shield, from random feasible start
 event rises at a random step and stays. Prints Markdown: how many episodes kept the rule, how many starts were
 refused, the processor time of a decision, and recall: of the (history, action) pairs that are certified with
 the witness carried or by plans of REFERENCE times the effort, the share that the planner certifies on its
-own. (tests/policy/test_planner.py has the recall against every future, on small worlds.)
+own. (tests/policy/planner/test_planner.py has the recall against every future, on small worlds.)
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class Experiment:
 
     case: a name of sim/cases.py, or "house", with a suffix of tasks.py for a harder main task. house: then
     which one, as evaluation/houses.py takes it.
-    model: a name of evaluation/models.py. noise: a name of evaluation/disturbance.py.
+    model: a name of evaluation/models/. noise: a name of evaluation/disturbance.py.
     """
 
     case: str
