@@ -71,7 +71,8 @@ class Settings(BaseSettings):
 
     max_owner_bytes: AnyCount = 8 << 30  # most that one key's maps and policies take on the disk
     max_stored_bytes: AnyCount = 32 << 30  # most that all maps and policies take on the disk
-    disk_reserve_bytes: AnyCount = 64 << 20  # of its disk, free for running sessions
+    # So much of the data folder's disk is kept free for running sessions: no other request may use it.
+    disk_reserve_bytes: AnyCount = 64 << 20
     max_maps: Count = 1000  # most uploaded maps kept
     max_policies: Count = 1000  # most policies kept
     max_sessions: Count = 100_000  # most sessions in the store; those in the archive do not count
