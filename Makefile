@@ -34,8 +34,8 @@ run: .venv/.server
 # One thread for each process: with two for each of four, numpy's and torch's spend their time in waiting for each other.
 test: export OMP_NUM_THREADS = 1
 test: .venv/.dev
-	$(BIN)/python -m specshield.service.startup  # or each of four processes would compile what a server needs
-	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder  # each module's tests stay in one process; four keep two cores busy
+	$(BIN)/python -m specshield.service.startup  # or each of six processes would compile what a server needs
+	$(BIN)/python -m pytest -n 6 --dist loadfile --no-loadscope-reorder  # each module's tests stay in one process; six keep two cores busy
 
 # The wheels, into dist/: one that compiles at its first start, one that brings its kernels for this Python and
 # processor. Both are installed in a new environment and run in an empty folder, as a newcomer would.
