@@ -211,6 +211,10 @@ def valid(item: Mapping[str, Any]) -> str:
         return "a finite number, or null for minus infinity"
     if context.get("pattern") == f"^{ID}$":
         return ID_TOLD
+    if item["type"] in ("list_type", "too_short", "too_long"):
+        where = (None, *item["loc"])
+        if where[-1] == "initial_pose" or where[-2] == "poses":
+            return "three numbers [x, y, theta], in metres and radians"
     if item["type"] in told:
         return told[item["type"]].format(**context)
     return said.removeprefix("Value error, ").removeprefix("Input should be ")
