@@ -64,7 +64,9 @@ def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
     )
 
 
-@pytest.mark.parametrize("content", ['{"rooms?": []}', '{"rooms": {"Hall": {}}, "regions": {}}'])
+@pytest.mark.parametrize(
+    "content", ['{"rooms?": []}', '{"rooms": {"Hall": {}}, "regions": {}}', '{"info": {"title": "an API"}}']
+)
 def test_a_file_that_is_no_map_is_told_in_one_line(content, tmp_path):
     (tmp_path / "flat.json").write_text(content)
     refused = run_specshield(
@@ -132,6 +134,13 @@ def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
     assert line.startswith("--out cannot be used: Not a directory")
+
+
+def test_a_rule_that_no_start_can_keep_is_not_to_be_run(tmp_path):
+    asked = ("--map", "case1", "--rule", "F[0,9] x > 99", "--out", tmp_path)
+    made = run_specshield("policy", *asked, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert made.returncode == 1
+    assert made.stdout.splitlines()[-1].startswith("next    another rule or map")
 
 
 @pytest.mark.parametrize("asked", [("run", "case1"), ("demo", "--runs", 1), ("train", "--case", 1)])

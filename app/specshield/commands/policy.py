@@ -64,9 +64,11 @@ def policy(
         picture = out / f"{called}.svg"
         picture.write_bytes(client.policies.image(made.id))
     print(f"picture {picture}")
+    if made.metrics.get("feasible_start") == 0.0:
+        print("next    another rule or map: from no start that was tried can this rule be kept")
+        raise typer.Exit(1)
     following = f"specshield run {called}" if url is None else f"a session of policy {called!r} at {url}"
     print(f"next    {following}")
-    raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: no start can keep the rule
 
 
 def _show(status: StatusLine, found: Policy) -> None:
@@ -98,14 +100,14 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     if isinstance(content.get("rooms"), list):
         sizes = {} if assets is None else _read(assets, "--assets")
         return lambda client: _sent_house(client, content, sizes)
-    if "info" in content:
-        return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
+    if "info" in content and "data" in content:
+        return lambda client: client.maps.occupancy_grid(content["info"], content["data"])
     raise InputError(
         f"{path} is no map of a known form",
         path="--map",
         got=sorted(content)[:8],
-        expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid, or an "
-        "object with its `format`",
+        expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid with "
+        "`info` and `data`, or an object with its `format`",
     )
 
 
