@@ -161,10 +161,14 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
             await asyncio.to_thread(warmup.warm_up, part)
         gc.freeze()  # the objects of the kernels are permanent too
         gc.set_threshold(YOUNG, 10, 10)
+        said = ""
         while True:
-            with contextlib.suppress(StoreError):  # /readyz says that the store is away
+            try:
                 await asyncio.to_thread(check)
                 break
+            except StoreError as error:
+                if said != (said := str(error)):
+                    log.warning("not ready yet, and trying again: %s", said)
             await asyncio.sleep(CHECK_EVERY)
         startup.ready = True
         log.info("ready")
