@@ -141,6 +141,7 @@ def test_a_rule_that_no_start_can_keep_is_not_to_be_run(tmp_path):
     made = run_specshield("policy", *asked, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert made.returncode == 1
     assert made.stdout.splitlines()[-1].startswith("next    another rule or map")
+    assert (made.stdout + made.stderr).count("no start satisfies this formula") == 1
 
 
 @pytest.mark.parametrize("asked", [("run", "case1"), ("demo", "--runs", 1), ("train", "--case", 1)])

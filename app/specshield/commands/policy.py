@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,6 +39,7 @@ def policy(
     from specshield.sim.progress import StatusLine
 
     check_writable(out, "--out")
+    logging.getLogger("specshield").addHandler(logging.NullHandler())  # what the client would log is printed
     status = StatusLine()
     places = {} if regions is None else _read(regions, "--regions")
     machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # a file, or a preset's name
