@@ -204,7 +204,7 @@ def valid(item: Mapping[str, Any]) -> str:
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
         "string_pattern_mismatch": "a text of the form {pattern}",
-        "too_short": "at least {min_length} items",
+        "too_short": "{min_length} or more items",
         "too_long": "at most {max_length} items",
     }
     if item["type"] == "finite_number" and "logits" in item["loc"]:
