@@ -179,6 +179,7 @@ def test_a_policy_that_is_not_there_is_told_with_those_that_are(tmp_path):
     refused = run_specshield("run", "flat", "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert refused.returncode == 1
     assert "expected one of case1, case1-dqn, case2, case2-dqn, or the id" in refused.stderr
+    assert f"SPECSHIELD_DATA_DIR, {tmp_path / 'data'}" in refused.stderr  # by default below where one stands
 
 
 @pytest.mark.parametrize("asked", [("run", "case1"), ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")])
