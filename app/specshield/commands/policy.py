@@ -77,7 +77,8 @@ def _show(status: StatusLine, found: Policy) -> None:
     from specshield.sim.progress import duration
 
     left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
-    status.say(f"{found.status}: {found.error or f'{found.progress:4.0%}{left}'}")
+    state = "being made" if found.status == "training" else found.status  # most methods learn nothing
+    status.say(f"{state}: {found.error or f'{found.progress:4.0%}{left}'}")
 
 
 def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
