@@ -278,6 +278,7 @@ def report(
     from evaluation import writeup
 
     writeup.write_up(results, out)
+    typer.echo(f"page: {out}")
 
 
 def _check_page(page: Path) -> None:

@@ -62,7 +62,7 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
         os.environ.setdefault("NUMBA_CACHE_DIR", str(kernels))
     app = typer.Typer(
         help="Keeps robot foundation models inside their operating rules.",
-        epilog="The commands evaluate and report come with evaluation/, from a checkout: make install.",
+        epilog="More commands, such as evaluate, come with evaluation/, from a clone: make install.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         **options,

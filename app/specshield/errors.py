@@ -13,7 +13,7 @@ SpecshieldError
 │   ├── PolicyError             weights or a card that do not fit their task
 │   ├── InfeasibleStart         no action from the initial pose has a satisfying future
 │   ├── InfeasibleSwitch        no action from here has a future that satisfies the new rule
-│   ├── Unsupported             an accepted word whose power this build lacks
+│   ├── Unsupported             a known thing that cannot be had here
 │   ├── TooExpensive            it took more time or memory than the server gives to one request
 │   ├── HeadersTooLarge         request headers over the limit
 │   ├── BodyTooLarge            a request body over the limit

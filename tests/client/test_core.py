@@ -266,12 +266,13 @@ def test_a_server_that_starts_for_longer_than_a_call_may_take_is_said_to():
     assert waits == [0.7, 0.7]  # a third pause would begin a try later than four timeouts of 0.5 s
 
 
-def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts():
-    outcomes = [lost(0.01), starting("1"), answer({"status": "ok"})]
+def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts(caplog):
+    outcomes = [lost(0.01), lost(0.01), starting("1"), answer({"status": "ok"})]
     result, sent, waits = drive(calls.wait_until_ready(10.0), *outcomes)
     assert result is None
     assert {(request.method, request.path) for request in sent} == {("GET", "/readyz")}
-    assert waits == [calls.READY_EVERY] * 2
+    assert waits == [calls.READY_EVERY] * 3
+    assert [each.getMessage().split(":")[0] for each in caplog.records] == ["waiting"] * 2  # for each once
 
 
 def test_waiting_until_ready_ends_and_says_how_far_the_server_was():

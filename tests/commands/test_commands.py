@@ -64,7 +64,9 @@ def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
     )
 
 
-@pytest.mark.parametrize("content", ['{"rooms?": []}', '{"rooms": {"Hall": {}}, "regions": {}}'])
+@pytest.mark.parametrize(
+    "content", ['{"rooms?": []}', '{"rooms": {"Hall": {}}, "regions": {}}', '{"info": {"title": "an API"}}']
+)
 def test_a_file_that_is_no_map_is_told_in_one_line(content, tmp_path):
     (tmp_path / "flat.json").write_text(content)
     refused = run_specshield(
@@ -134,6 +136,14 @@ def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_
     assert line.startswith("--out cannot be used: Not a directory")
 
 
+def test_a_rule_that_no_start_can_keep_is_not_to_be_run(tmp_path):
+    asked = ("--map", "case1", "--rule", "F[0,9] x > 99", "--out", tmp_path)
+    made = run_specshield("policy", *asked, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert made.returncode == 1
+    assert made.stdout.splitlines()[-1].startswith("next    another rule or map")
+    assert (made.stdout + made.stderr).count("no start satisfies this formula") == 1
+
+
 @pytest.mark.parametrize("asked", [("run", "case1"), ("demo", "--runs", 1), ("train", "--case", 1)])
 def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp_path):
     (tmp_path / "file").touch()
@@ -169,6 +179,7 @@ def test_a_policy_that_is_not_there_is_told_with_those_that_are(tmp_path):
     refused = run_specshield("run", "flat", "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert refused.returncode == 1
     assert "expected one of case1, case1-dqn, case2, case2-dqn, or the id" in refused.stderr
+    assert f"SPECSHIELD_DATA_DIR, {tmp_path / 'data'}" in refused.stderr  # by default below where one stands
 
 
 @pytest.mark.parametrize("asked", [("run", "case1"), ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")])

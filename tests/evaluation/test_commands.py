@@ -79,7 +79,8 @@ def test_report_writes_a_page_and_its_pictures(tmp_path):
     specshield("evaluate", "--case", "2", "--methods", "unmodified,simplex", *arguments)
     specshield("evaluate", "--case", "2", "--methods", "ours@conformal/4", "--noise", "gaussian", *arguments)
     page = tmp_path / "page.md"
-    specshield("report", str(tmp_path / "results"), "--out", str(page))
+    written = specshield("report", str(tmp_path / "results"), "--out", str(page))
+    assert written.stdout == f"page: {page}\n"
     text = (tmp_path / "page" / "noise.md").read_text()
     assert "| gaussian | ours@0.04/4 | 2 of 2 (15.8 to 100.0 %)" in text
     assert "ours@0.04/4: 0.0391 m from 60 other runs; it covered every step of" in text

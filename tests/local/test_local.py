@@ -482,6 +482,13 @@ def test_a_rule_that_reads_nothing_and_does_not_hold_is_proved_to_fail(rule: str
     assert caught.value.details == {"proved": True, "conjuncts": []}
 
 
+def test_a_missing_part_is_told_with_the_extra_that_brings_it() -> None:
+    code = "import sys; sys.modules['scipy'] = None; import specshield.local"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    told = "ModuleNotFoundError: specshield.local needs scipy: pip install 'specshield[core]'"
+    assert done.stderr.splitlines()[-1] == told
+
+
 def test_no_web_part_is_imported() -> None:
     code = "import specshield.local, specshield.client.models, sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

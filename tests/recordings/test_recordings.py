@@ -304,6 +304,9 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     refused = run_specshield("export", "README.md", "--to", "csv", cwd=tmp_path)
     (line,) = refused.stderr.splitlines()
     assert line.startswith("the file is no record of a session, or not all of one; expected what GET /v1/")
+    refused = run_specshield("export", "recrod", "--to", "csv", "--url", server.url, cwd=tmp_path)
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("there is no file 'recrod', so it was taken for a session's id: there is no")
     bag_of(tmp_path / "bag", [START] * 70, 1.0)
     words = ["check-drive", "bag", "--policy", "case1", "--step-seconds", "1"]
     refused = run_specshield(*words, cwd=tmp_path)

@@ -490,6 +490,12 @@ def test_steps(client, begin, step, fields, type, path):
     assert client.get(f"/v1/sessions/{session['id']}").json() == session
 
 
+@pytest.mark.parametrize("poses", [START, [START[:2]], [{"x": 1.0, "y": 1.5, "theta": 0.0}]])
+def test_what_is_no_pose_is_told_with_what_a_pose_is(begin, step, poses):
+    answer = problem(step(begin(), t=0, poses=poses, logits=LOGITS), 422, "invalid-pose", "poses[0]")
+    assert answer["expected"] == "three numbers [x, y, theta], in metres and radians"
+
+
 def test_a_misspelt_field_is_told_before_a_missing_one_with_the_names_there_are(client, begin, step):
     told = step(begin(), t=0, poses=[START], logit=LOGITS)
     answer = problem(told, 422, "invalid-input", "logit")

@@ -130,7 +130,10 @@ def test_a_step_decided_and_sent_otherwise_is_a_conflict(client, begin, step, ch
     step(session, 0, [START])
     before = state(client, session)
     answer = step(session, 0, **{"poses": [START], **change})
-    assert problem(answer, 409, "step-conflict")["expected_t"] == 1
+    told = problem(answer, 409, "step-conflict")
+    name = "pose" if "poses" in change else next(iter(change))
+    assert told["detail"] == f"step 0 was decided already, with other values of: {name}"
+    assert told["expected_t"] == 1
     assert state(client, session) == before
 
 
@@ -194,7 +197,8 @@ def test_the_last_step_is_max_steps(client, begin, step):
     for t in range(9):
         answer = step(session, t, ahead(t)[-1:]).json()
     assert answer["finished"]
-    problem(step(session, 9, ahead(9)), 409, "session-finished")
+    told = problem(step(session, 9, ahead(9)), 409, "session-finished")
+    assert told["expected"].startswith("a new session")
     assert step(session, 8, ahead(8)[-1:]).json() == answer  # a replay
 
 

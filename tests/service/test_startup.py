@@ -156,6 +156,9 @@ def test_what_an_earlier_start_compiled_counts(tmp_path, monkeypatch):
     problem = Startup(compiling=True).problem()
     assert problem.details["kernels"] == {"compiled": 3, "expected": KERNELS}
     assert f"3 of about {KERNELS} kernels are compiled" in str(problem)
+    for i in range(KERNELS):
+        (tmp_path / f"{i}.nbi").touch()
+    assert "those of an earlier version are compiled anew" in str(Startup(compiling=True).problem())
 
 
 @pytest.fixture

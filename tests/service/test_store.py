@@ -196,6 +196,9 @@ def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):
             assert (response.status_code, response.json()["type"]) == (503, "store-unavailable")
             assert response.headers["retry-after"] == "1"
         assert client.get("/livez").status_code == 200
+    said = [line for line in server.log.read_text().splitlines() if "not ready yet" in line]
+    assert len(said) == 1  # once, and not at each try
+    assert "the store cannot be reached" in said[0]
 
 
 def alive(client):

@@ -73,7 +73,7 @@ def test_what_was_sent_to_a_server_is_found_in_its_data_folder(server, client, b
     assert told(capsys, tmp_path, answer.content, data_dir=server.data_dir)[0] == 0
     other = with_config(answer.content, 0, signals={"battery": 91.0})
     status, said = told(capsys, tmp_path, other, data_dir=server.data_dir)
-    assert (status, "from step 0: signals differ" in said) == (1, True)
+    assert (status, "the rule from step 0 on differs in signals" in said) == (1, True)
     status, said = told(capsys, tmp_path, answer.content)
     assert (status, "the chain is whole" in said, "NOT decided again" in said) == (2, True, True)
     assert client.get("/v1/sessions/none/record").json()["type"] == "not-found"
@@ -199,7 +199,7 @@ def test_a_config_that_tells_of_another_task_than_the_policies_is_found_out(case
     status, said = told(capsys, tmp_path, with_config(case1[0], 0, **{name: FORGED[name]}))
     assert status == 1
     assert "the chain is whole" in said
-    assert f"NOT as decided: from step 0: {name} differ" in said
+    assert f"NOT as decided: the rule from step 0 on differs in {name}" in said
 
 
 def test_a_config_that_no_server_wrote_breaks_nothing(case1, capsys, tmp_path):
@@ -224,8 +224,8 @@ def test_a_switch_that_tells_of_another_rule_or_clock_is_found_out(server, capsy
     assert with_config(content, 1) == content
     assert told(capsys, tmp_path, content)[0] == 0
     for changed, expected in (
-        ({"horizon": 3}, "NOT as decided: from step 3: horizon differ"),
-        ({"formula": "F[0,60] x > 1"}, "NOT as decided: from step 3: formula differ"),
+        ({"horizon": 3}, "NOT as decided: the rule from step 3 on differs in horizon"),
+        ({"formula": "F[0,60] x > 1"}, "NOT as decided: the rule from step 3 on differs in formula"),
         ({"clock": "restart"}, "NOT as it was: step 3: the origin"),
         ({"clock": "restart", "origin": 3}, "NOT as decided: step 3"),
     ):
@@ -251,7 +251,7 @@ def test_a_forged_chain_is_whole_and_its_answer_is_found_out(case1, capsys, tmp_
         status, said = told(capsys, tmp_path, forged(content, 7, **changed))
         assert status == 1
         assert "the chain is whole" in said
-        assert f"step 7: {named} differ" in said
+        assert f"step 7 differs in {named}" in said
         assert seal not in said, "whoever kept the seal knows at once"
 
 
@@ -262,7 +262,9 @@ def test_what_another_version_decided_has_a_status_of_its_own(case1, capsys, tmp
     assert (status, "decided by specshield 0.0.9\n" in said) == (0, True)
     status, said = told(capsys, tmp_path, forged(old, 7, kl=0.5))
     assert status == 4
-    assert f"decided by specshield 0.0.9, and otherwise by this one, {__version__}: step 7: kl differ" in said
+    assert (
+        f"decided by specshield 0.0.9, and otherwise by this one, {__version__}: step 7 differs in kl" in said
+    )
     assert "NOT" not in said
     assert told(capsys, tmp_path, forged(old, 7, logits=b""))[0] == 4  # cannot be decided again at all
     config = json.loads(msgspec.msgpack.decode(content)["config"])

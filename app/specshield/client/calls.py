@@ -14,7 +14,14 @@ from specshield.client.away import OnFailure, on_failure_value
 from specshield.client.core import Flow, Wait, call, deliver, erase, fetch
 from specshield.client.models import Map, Policy, SessionInfo, Spec, build
 from specshield.client.wire import Content, Failure, Numbers, Reply, Request
-from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
+from specshield.errors import (
+    InputError,
+    SessionExists,
+    SpecshieldError,
+    StoreError,
+    TransportError,
+    TransportTimeout,
+)
 
 log = logging.getLogger("specshield")
 READY_EVERY = 0.25  # [s] between two requests whether the server is ready
@@ -23,12 +30,12 @@ READY_EVERY = 0.25  # [s] between two requests whether the server is ready
 def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     """Return when the server is ready to decide: its first start takes about a minute.
 
-    This also waits for a server that cannot be reached yet. Raises TransportTimeout after `timeout` [s], with
-    the progress of the server's start.
+    This also waits for a server that cannot be reached yet. A warning is logged of what it waits for. Raises
+    TransportTimeout after `timeout` [s], with the progress of the server's start.
     """
     if timeout not in (0.0, math.inf):  # to ask once, or for ever
         wire.seconds_value(timeout, "timeout")
-    seconds = 0.0
+    seconds, told = 0.0, SpecshieldError
     while True:
         outcome = yield Request("GET", "/readyz")
         seconds += outcome.seconds
@@ -37,6 +44,9 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
         error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
         if seconds >= timeout:
             raise TransportTimeout(f"not ready after {seconds:.1f} s: {error}") from error
+        if told is not type(error):  # else a program whose server was not started would wait without a word
+            told = type(error)
+            log.warning("waiting: %s", error)
         pause = min(READY_EVERY, timeout - seconds)
         yield Wait(pause)
         seconds += pause

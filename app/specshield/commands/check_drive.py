@@ -23,9 +23,9 @@ def check_drive(
         str | None, typer.Option(help="Topic of poses in the map's frame. By default the only one.")
     ] = None,
 ) -> None:
-    """Say whether a drive in a rosbag2 kept a policy's rule, and from which step on it could not be kept.
+    """Say whether a drive in a rosbag2 kept a policy's rule, and from which step on no way to was found.
 
-    The exit status is 1 if the rule is broken, or open with no way left to keep it; else 0.
+    The exit status is 1 if the rule is broken, or open while no way to keep it was found; else 0.
     """
     from specshield.local import LocalShield
     from specshield.recordings import drive

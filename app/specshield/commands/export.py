@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from specshield.errors import InputError, NotFound
+from specshield.errors import InputError, NotFound, SpecshieldError
 
 if TYPE_CHECKING:  # every command imports this module
     from specshield.world.regions import Region
@@ -52,7 +52,11 @@ def export(
             grid, rooms = known.grid, known.rooms
     else:
         with client_at(url, api_key) as client, tempfile.TemporaryDirectory() as folder:
-            client.sessions.get(session).save_record(Path(folder) / "record")
+            try:
+                client.sessions.get(session).save_record(Path(folder) / "record")
+            except SpecshieldError as error:
+                told = f"there is no file {session!r}, so it was taken for a session's id: {error.message}"
+                raise error.retold(told) from None
             found = chain.read((Path(folder) / "record").read_bytes())
             with suppress(NotFound):  # a map may be deleted once its sessions are closed
                 grid, rooms = map_of_service(client, found.configs[0].map_id)

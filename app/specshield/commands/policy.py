@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,6 +39,7 @@ def policy(
     from specshield.sim.progress import StatusLine
 
     check_writable(out, "--out")
+    logging.getLogger("specshield").addHandler(logging.NullHandler())  # what the client would log is printed
     status = StatusLine()
     places = {} if regions is None else _read(regions, "--regions")
     machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # a file, or a preset's name
@@ -64,16 +66,19 @@ def policy(
         picture = out / f"{called}.svg"
         picture.write_bytes(client.policies.image(made.id))
     print(f"picture {picture}")
+    if made.metrics.get("feasible_start") == 0.0:
+        print("next    another rule or map: from no start that was tried can this rule be kept")
+        raise typer.Exit(1)
     following = f"specshield run {called}" if url is None else f"a session of policy {called!r} at {url}"
     print(f"next    {following}")
-    raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: no start can keep the rule
 
 
 def _show(status: StatusLine, found: Policy) -> None:
     from specshield.sim.progress import duration
 
     left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
-    status.say(f"{found.status}: {found.error or f'{found.progress:4.0%}{left}'}")
+    state = "being made" if found.status == "training" else found.status  # most methods learn nothing
+    status.say(f"{state}: {found.error or f'{found.progress:4.0%}{left}'}")
 
 
 def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
@@ -98,14 +103,14 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     if isinstance(content.get("rooms"), list):
         sizes = {} if assets is None else _read(assets, "--assets")
         return lambda client: _sent_house(client, content, sizes)
-    if "info" in content:
-        return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
+    if "info" in content and "data" in content:
+        return lambda client: client.maps.occupancy_grid(content["info"], content["data"])
     raise InputError(
         f"{path} is no map of a known form",
         path="--map",
         got=sorted(content)[:8],
-        expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid, or an "
-        "object with its `format`",
+        expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid with "
+        "`info` and `data`, or an object with its `format`",
     )
 
 

@@ -25,6 +25,7 @@ def run_policy(
     """Drive a simulated robot through an episode, with and without the shield, and draw both."""
     from specshield.commands.serving import client_of
     from specshield.lookahead.preferences import check_shaping
+    from specshield.service.settings import read_settings
     from specshield.sim import picture
     from specshield.sim.campaign import begin
     from specshield.sim.episodes import with_shield, without_shield
@@ -40,7 +41,8 @@ def run_policy(
             found = client.policies.get(policy)
         except NotFound as error:
             names = ", ".join(each.name for each in client.policies.list() if each.name)
-            error.expected = f"one of {names}, or the id of another policy in SPECSHIELD_DATA_DIR"
+            folder = read_settings().data_dir.absolute()
+            error.expected = f"one of {names}, or the id of another policy in SPECSHIELD_DATA_DIR, {folder}"
             raise
         case = _case(found.id, found.name or found.id[:12], place, seed)
         session, start, refused = begin(client, case, found.id, seed, shaping=shaping)

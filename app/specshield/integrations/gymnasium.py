@@ -5,9 +5,9 @@
     action = rng.choice(env.action_space.n, p=info["distribution"])
     observation, reward, terminated, truncated, info = env.step(action)
 
-`info["action_mask"]` says after which actions the rule can still be kept, and `info["distribution"]` is the
-model's distribution, shaped. If an action without probability there is asked for, the action that the shield
-drew is executed instead; `info["executed"]` says which one was. A rule often looks further than the task. So
+`info["distribution"]` is the shield's answer, and `info["action_mask"]` marks the actions to which it gives a
+probability above 0. If another action is asked for, the action that the shield drew is executed instead;
+`info["executed"]` says which one was. A rule often looks further than the task. So
 if the environment terminates while the rule is pending, the episode goes on without reward along the
 certified continuation until the rule is decided. The environment has to take steps after it has terminated,
 and its time limit has to be later than the rule's horizon.

@@ -11,7 +11,11 @@
 It serves training loops, tests and recordings. Nothing is stored: a session ends with its process.
 """
 
-from specshield.local.session import LocalSession
-from specshield.local.shield import LocalShield
+try:
+    from specshield.local.session import LocalSession
+    from specshield.local.shield import LocalShield
+except ModuleNotFoundError as error:  # the base install is the client
+    told = f"specshield.local needs {error.name}: pip install 'specshield[core]'"
+    raise ModuleNotFoundError(told, name=error.name) from error
 
 __all__ = ["LocalSession", "LocalShield"]

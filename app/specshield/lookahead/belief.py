@@ -109,7 +109,7 @@ def update(belief: Belief, goals: Goals, pose: Floats, said: Floats, end: float,
     sided = _sided(body, said)  # a stand-in that wanders does not say to which side the model turns
     excess = TRACK * belief.excess + float(inner(belief.probabilities(), charges)) - usual
     excess -= float(belief.probabilities()[-1]) * sided
-    cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
+    cost = np.round(KEEP * belief.cost + charges, 6)  # as recorded decisions have it
     row, column = cell_of(goals, x, y)
     bearing = bearing_of(goals, int(np.argmin(cost[:-1])), row, column, theta)
     features = np.array([features_of(body, bearing, m, blocked[m]) for m in range(len(said))])

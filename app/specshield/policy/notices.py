@@ -79,8 +79,8 @@ def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
     if kept == silent:
         return ()
     return (
-        f"whatever the signals do, the rule can be kept from {kept} of {STARTS} random starts; from "
-        f"{silent}, which is what feasible_start counts, if they stay as they are",
+        f"of {STARTS} random starts, the rule can be kept from {kept} whatever the signals do, and from "
+        f"{silent} if they stay as they are; feasible_start takes them to stay",
     )
 
 

@@ -1,4 +1,6 @@
-"""Judges a drive in a rosbag2 by a rule: whether it was kept, and from which step on it could not be kept."""
+"""Judges a drive in a rosbag2 by a rule: whether it was kept, and from which step on no way to keep it was
+found.
+"""
 
 from __future__ import annotations
 

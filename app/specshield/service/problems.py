@@ -204,13 +204,17 @@ def valid(item: Mapping[str, Any]) -> str:
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
         "string_pattern_mismatch": "a text of the form {pattern}",
-        "too_short": "at least {min_length} items",
+        "too_short": "{min_length} or more items",
         "too_long": "at most {max_length} items",
     }
     if item["type"] == "finite_number" and "logits" in item["loc"]:
         return "a finite number, or null for minus infinity"
     if context.get("pattern") == f"^{ID}$":
         return ID_TOLD
+    if item["type"] in ("list_type", "too_short", "too_long"):
+        where = (None, *item["loc"])
+        if where[-1] == "initial_pose" or where[-2] == "poses":
+            return "three numbers [x, y, theta], in metres and radians"
     if item["type"] in told:
         return told[item["type"]].format(**context)
     return said.removeprefix("Value error, ").removeprefix("Input should be ")

@@ -111,8 +111,8 @@ class Startup:
         if not self.compiling:
             return Starting("the server is starting", expected=expected)
         return Starting(
-            f"the server is starting: {on_disk()} of about {KERNELS} kernels are compiled; all of them, at "
-            f"the first start of an installation, take about {TAKES} s",
+            f"the server is starting: {_progress()}; all of them, at the first start of an installation, "
+            f"take about {TAKES} s",
             expected=expected,
             kernels={"compiled": on_disk(), "expected": KERNELS},
             parts={part: "done" if part in self.parts else "compiling" for part in warmup.PARTS},
@@ -122,6 +122,13 @@ class Startup:
 def on_disk() -> int:
     """How many of the kernels that a start needs are on the disk, by this start or an earlier one."""
     return min(compiled.on_disk(), KERNELS)
+
+
+def _progress() -> str:
+    """How far the compiling is. Kernels of an earlier version are on the disk until they are replaced."""
+    if on_disk() == KERNELS:
+        return "the kernels are on the disk, and those of an earlier version are compiled anew"
+    return f"{on_disk()} of about {KERNELS} kernels are compiled"
 
 
 async def until_it_may_listen(startup: Startup, prepared: asyncio.Task[Any]) -> None:
@@ -161,10 +168,14 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
             await asyncio.to_thread(warmup.warm_up, part)
         gc.freeze()  # the objects of the kernels are permanent too
         gc.set_threshold(YOUNG, 10, 10)
+        said = ""
         while True:
-            with contextlib.suppress(StoreError):  # /readyz says that the store is away
+            try:
                 await asyncio.to_thread(check)
                 break
+            except StoreError as error:
+                if said != (said := str(error)):
+                    log.warning("not ready yet, and trying again: %s", said)
             await asyncio.sleep(CHECK_EVERY)
         startup.ready = True
         log.info("ready")
@@ -231,7 +242,7 @@ async def _tell() -> None:
     )
     while True:
         await asyncio.sleep(TELL_EVERY)
-        log.info("%d of about %d kernels are compiled", on_disk(), KERNELS)
+        log.info("%s", _progress())
 
 
 @asynccontextmanager

@@ -64,7 +64,7 @@ def verify(file: Path, settings: Settings) -> int:
         return 2
     for config, names in zip(found.configs, wrong, strict=True):
         if names:
-            print(f"NOT as decided: from step {config.begins}: {', '.join(names)} differ from the policies'")
+            print(f"NOT as decided: the rule from step {config.begins} on differs in {', '.join(names)}")
     return 1 if any(wrong) else _decide(found, shields)
 
 
@@ -86,9 +86,9 @@ def _decide(found: Chain, shields: Sequence[Shield]) -> int:
         print(f"{said}: it cannot be decided again: {error}")
         return status
     for t, fields in differing[:20]:
-        print(f"{told(t)[0]}: step {t}: {', '.join(fields)} differ")
+        print(f"{told(t)[0]}: step {t} differs in {', '.join(fields)}")
     if differing:
-        print(f"{len(differing)} steps differ")
+        print(f"steps that differ: {len(differing)}")
         return told(differing[0][0])[1]
     print("every step is decided again to the same bytes")
     return 0

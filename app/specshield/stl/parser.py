@@ -246,7 +246,7 @@ class _Parser:
             raise self._too_deep(token)
         limit = self._max_horizon
         if limit is not None and isinstance(node, Formula) and node.horizon > limit:
-            problem = f"a horizon of {node.horizon} steps at position {token.position}"
+            problem = f"this looks {node.horizon} steps ahead at position {token.position}"
             raise wrong(problem, node.horizon, f"at most {limit} steps", token.position, HorizonError)
         return node
 

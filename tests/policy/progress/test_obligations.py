@@ -64,7 +64,7 @@ def test_the_fields() -> None:
 
 
 def test_the_error_names_the_part_that_is_outside() -> None:
-    with pytest.raises(FragmentError, match=r"'a U\[0,3\] b'") as caught:
+    with pytest.raises(FragmentError, match=r"'a U\[0,3\] b'; expected parts F\[a,b\] p") as caught:
         obligations(parse("F[0,1] a and G[0,1] (b and (a U[0,3] b))"))
     assert caught.value.got == "a U[0,3] b"
 

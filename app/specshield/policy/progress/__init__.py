@@ -65,8 +65,8 @@ def make_rules(task: Task) -> Rules:
     """Compiles the task's formula. Raises FragmentError outside the paper's fragment or MAX_OBLIGATIONS."""
     parts = obligations(task.formula)
     if len(parts) > MAX_OBLIGATIONS:
-        expected = f"at most {MAX_OBLIGATIONS}; or method 'planner', which takes any formula"
-        raise FragmentError("too many obligations", got=len(parts), expected=expected)
+        expected = f"at most {MAX_OBLIGATIONS}; or the method 'planner', which takes any formula"
+        raise FragmentError("the formula has too many parts", got=len(parts), expected=expected)
     rows = [(KINDS[p.kind], p.a, p.b, p.c1, p.c2, p.c1 + p.b) for p in parts]
     kind, a, b, c1, c2, last = np.array(rows, np.int64).reshape(-1, 6).T.copy()
     programs = compile_predicates([part.predicate for part in parts], places(task))

@@ -56,9 +56,10 @@ def _normal(formula: Formula) -> tuple[Obligation, ...]:
             if isinstance(formula, Eventually) and len(inner) == 1:
                 return (_under_eventually(a, b, inner[0]),)
     raise FragmentError(
-        "the formula is outside the fragment of this method",
+        "a part of the formula is of a form that is not taken here",
         got=str(formula),
-        expected="F, G and F[a,c1] G[c2,b] over predicates, joined by and; or the method 'planner'",
+        expected="parts F[a,b] p, G[a,b] p and F[a,c] G[d,b] p, joined by 'and', with no F, G or U in p; or "
+        "the method 'planner', which takes any formula",
     )
 
 

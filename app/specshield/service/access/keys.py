@@ -89,7 +89,8 @@ class Keys:
             if not (self._read or self._own):
                 raise StoreError("the store cannot be reached, so the API keys are not known yet")
             what = "the API key is not one of this server's" if digest else "an API key is needed"
-            raise Unauthorized(what, path="Authorization", expected="Bearer <key>")
+            expected = "Bearer <key>: the SDK sends its `api_key`, commands send SPECSHIELD_API_KEY"
+            raise Unauthorized(what, path="Authorization", expected=expected)
         return found
 
     async def until_refused(self, authorization: bytes) -> None:

@@ -118,22 +118,26 @@ class Session(NamedTuple):
     def over(self, t: int) -> SessionFinished:
         """The error for a step that is asked for after the session's end."""
         told = f"session {self.id!r} is over: no further step is decided"
-        return SessionFinished(told, path="t", got=t, expected="a step already decided, to read it again")
+        expected = "a new session; or a step that was decided, to read its answer again"
+        return SessionFinished(told, path="t", got=t, expected=expected)
 
     def replay(self, step: bytes, request: StepBody) -> StepAnswer:
         """The stored answer. Raises StepConflict where it answered another request."""
         kept, row = record.decode(step), self.rows[request.t]
         asked, before = asked_of(request), kept.asked(row, self.signal_names)
-        if not (
-            (asked.pose, asked.signals, asked.main_task_done)
-            == (before.pose, before.signals, before.main_task_done)
-            and _equal(asked.logits, before.logits)
-            and _equal(asked.occupied, before.occupied)
-            and _equal(asked.free, before.free)
-        ):
+        same = {
+            "pose": asked.pose == before.pose,
+            "signals": asked.signals == before.signals,
+            "main_task_done": asked.main_task_done == before.main_task_done,
+            "logits": _equal(asked.logits, before.logits),
+            "occupied": _equal(asked.occupied, before.occupied),
+            "free": _equal(asked.free, before.free),
+        }
+        if not all(same.values()):
             t, ahead = request.t, self.state.next_t
-            told = f"step {t} was decided for another pose, logits, signals, main_task_done, occupied or free"
-            expected = f"the same request again, or step {ahead}"
+            other = ", ".join(name for name, equal in same.items() if not equal)
+            told = f"step {t} was decided already, with other values of: {other}"
+            expected = f"the same request again, or step {ahead}; a session is for one robot alone"
             raise StepConflict(told, path="t", got=t, expected=expected, expected_t=ahead)
         history.join(self.poses, request.t, np.array(request.poses))
         return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)].actions)

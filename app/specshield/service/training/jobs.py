@@ -91,7 +91,7 @@ class Jobs:
         state = {name.decode(): value.decode() for name, value in found.items()}
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
-            error = "the store has lost the state of its training; ask for it again"
+            error = "the store no longer knows how far it was made; ask for it again"
         if status == "queued" and not alive and not self._waits(state["method"], state["attempt"]):
             self.sign_of_life(id, state["attempt"])  # a worker has it; if that has died, this ends soon
             self.report(id, state["attempt"], status="training")

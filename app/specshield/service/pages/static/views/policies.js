@@ -37,5 +37,5 @@ function fill(row, policy) {
   const [name, , , state] = row.children;
   write(name.firstChild, called(policy));
   state.firstChild.className = `badge ${policy.status}`;
-  write(state.firstChild, policy.status === "training" ? `${policy.status}, ${percent(policy.progress)}` : policy.status);
+  write(state.firstChild, policy.status === "training" ? `being made, ${percent(policy.progress)}` : policy.status);
 }

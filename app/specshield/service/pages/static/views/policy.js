@@ -40,7 +40,8 @@ export async function show(place, { id, signal }) {
 
 function stands(policy) {
   const left = policy.eta_s === null ? "" : `, about ${Math.ceil(policy.eta_s)} s left`;
-  const head = el("div", { class: "row spread" }, el("h2", {}, "State"), el("span", { class: `badge ${policy.status}` }, policy.status));
+  const state = policy.status === "training" ? "being made" : policy.status;
+  const head = el("div", { class: "row spread" }, el("h2", {}, "State"), el("span", { class: `badge ${policy.status}` }, state));
   if (policy.status === "failed") return [head, el("p", { class: "problem", role: "alert" }, policy.error ?? "It failed.")];
   if (policy.status !== "ready")
     return [head, el("progress", { max: 1, value: policy.progress, "aria-label": "Progress" }), el("p", {}, `${percent(policy.progress)}${left}`)];
