@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from specshield.client import ShieldClient
-from specshield.client.wiring import between, diagnosed
+from specshield.client.wiring import Motion, between, diagnosed
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
 from tests.serving import RunningServer
@@ -107,6 +107,7 @@ def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0)
             None,
             "the robot's turns are 1.4 times as wide",
         ),
+        (lambda name, motion, _: (motion[0], -0.01 * motion[1]), None, "the robot does not turn"),
         (
             lambda name, motion, _: MOTIONS.get(OTHERS.get(name, ""), motion),
             None,
@@ -139,6 +140,16 @@ def test_a_mistake_is_told_in_words_and_once(caplog, body, frame, words):
 )
 def test_what_hinders_single_motions_is_no_mistake(caplog, body):
     assert [told(caplog, body, steps=150, seed=seed) for seed in range(3)] == [[], [], []]
+
+
+def test_a_robot_that_is_held_before_a_wall_has_no_actions_in_another_order():
+    """Its poses differ by the noise of its localisation alone, and its move would lead next to nowhere."""
+    before, leads = (0.0, 0.0, 0.0), ((0.03, 0.0, 0.0), (0.0, 0.0, 0.5), (-0.25, 0.0, 0.0))
+    motions = []
+    for k in range(24):
+        after = (0.075 if k % 6 == 1 else 0.055, 0.0, 0.0)
+        motions.append(Motion(k % 3, between(before, leads[k % 3]), between(before, after), before, leads))
+    assert "something holds the robot" in (diagnosed(motions, ("forward", "left", "back")) or "")
 
 
 def test_the_client_of_a_server_tells_it_too(caplog, server: RunningServer):

@@ -27,10 +27,12 @@ LONGER = (
     "the robot's strides are {:.2g} times as long as its actions say; poses and `translate` are in metres"
 )
 WIDER = "the robot's turns are {:.2g} times as wide as its actions say; theta and `rotate` are in radians"
+UNTURNED = "the robot does not turn: send its new heading with each pose; or something keeps it from turning"
 log = logging.getLogger("specshield")
 
 
 Move = tuple[complex, float]  # from the robot before it: forward + left i [m], a turn to the left [rad]
+STILL: Move = (0j, 0.0)
 
 
 class Motion(NamedTuple):
@@ -62,7 +64,7 @@ class Wiring:
         before, action = last[1], last[2].execute
         leads = last[2].next_poses
         motion = Motion(action, between(before, leads[action]), between(before, pose), before, leads)
-        if motion.told == (0j, 0.0):
+        if motion.told == STILL:
             return
         self._motions.append(motion)
         wrong = None if alike(motion.found, motion.told) else diagnosed(self._motions, last[2].action_names)
@@ -134,7 +136,7 @@ def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[
 
     yield (
         "the poses do not change: send the robot's new pose at each step; or something holds the robot",
-        [(0j, 0.0)] * len(motions),
+        [STILL] * len(motions),
     )
     yield (
         "the poses are a step old: each shows what the motion before the last one did; send the pose "
@@ -169,7 +171,8 @@ def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[
     turns = [each for each in motions if abs(each.told[1]) > TURNED]
     if turns:
         wider = _middle(each.found[1] / each.told[1] for each in turns)
-        yield WIDER.format(wider), [(way, wider * turn) for way, turn in told]
+        words = UNTURNED if abs(wider) <= HELD else WIDER.format(wider)
+        yield words, [(way, wider * turn) for way, turn in told]
     done = {action: _done(motions, action) for action in {each.action for each in motions}}
     exchanged = [
         f"{names[a]!r} does what {names[b]!r} should do" for a, b in done.items() if b not in (a, None)
@@ -183,13 +186,22 @@ def mistakes(motions: Sequence[Motion], names: Sequence[str]) -> Iterator[tuple[
 
 
 def _done(motions: Sequence[Motion], action: int) -> int | None:
-    """The action that most of the motions look like that were to be `action`; None if they look like none."""
+    """The action that most of the motions look like that were to be `action`; None if they look like none.
+
+    Where a wall is in front of the robot, or an action is to wait, poses that differ by noise alone would
+    look like that action, so it is left out there.
+    """
     like = Counter(
-        next((b for b, to in enumerate(each.leads) if alike(each.found, between(each.before, to))), None)
+        next((b for b, way in _ways(each) if alike(each.found, way) and not alike(STILL, way)), None)
         for each in motions
         if each.action == action and abs(each.found[0]) + abs(each.found[1]) > TURNED
     )
     return like.most_common(1)[0][0] if like else None
+
+
+def _ways(motion: Motion) -> Iterator[tuple[int, Move]]:
+    """Each action, and the motion that it would have been."""
+    return ((b, between(motion.before, to)) for b, to in enumerate(motion.leads))
 
 
 def _middle(values: Iterable[float]) -> float:
