@@ -123,6 +123,30 @@ Content-Length: {len(body)}
         assert count == answered.count(b"HTTP/1.1 200 ") == 3
 
 
+def test_trailers_are_no_headers(server: RunningServer) -> None:
+    """A field after the body takes no part in who asks and what is asked: whoever checked the head saw none."""
+    head = f"""POST /v1/specs/validate HTTP/1.1
+Host: {{host}}
+Content-Type: application/json
+Transfer-Encoding: chunked
+
+2
+{{{{}}}}
+0
+Host: {{trailer}}
+X-Request-ID: of-a-trailer
+
+""".replace("\n", "\r\n")
+    own = urlsplit(server.url).netloc
+    for host, trailer, status in ((own, "evil.example", 422), ("evil.example", own, 421)):
+        with _connect(server) as connection:
+            connection.sendall(head.format(host=host, trailer=trailer).encode())
+            answer = HTTPResponse(connection)
+            answer.begin()
+        assert answer.status == status
+        assert answer.headers["X-Request-ID"] != "of-a-trailer"
+
+
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:
     with _connect(small) as connection:
         assert connection.recv(1) == b""

@@ -99,6 +99,8 @@ class BoundedProtocol(HttpToolsProtocol):
         self._in_head, self._head = True, 0
 
     def on_header(self, name: bytes, value: bytes) -> None:
+        if not self._in_head:  # a trailer: uvicorn would add it to the headers, which may be read already
+            return
         self._head += len(name) + len(value)
         if self._head > 2 * self._most:  # `data_received` may have counted the same bytes
             raise ValueError("the head is too large")  # ends the parsing: uvicorn calls `send_400_response`
