@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -145,6 +146,17 @@ X-Request-ID: of-a-trailer
             answer.begin()
         assert answer.status == status
         assert answer.headers["X-Request-ID"] != "of-a-trailer"
+
+
+def test_a_caller_who_leaves_before_its_answer_writes_no_traceback(server: RunningServer) -> None:
+    """The connection is reset between the answer and its sending, in the next round of the event loop."""
+    request = f"GET /livez HTTP/1.1\r\nHost: {urlsplit(server.url).netloc}\r\n\r\n".encode()
+    for _ in range(100):
+        with _connect(server) as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # resets
+            connection.sendall(50 * request)
+    assert httpx.get(f"{server.url}/livez", timeout=HUNG, verify=False).status_code == 200
+    assert "Traceback" not in server.log.read_text()
 
 
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:

@@ -244,7 +244,8 @@ class Corked:
         if self._held:
             content = b"".join(self._held) if len(self._held) > 1 else self._held[0]
             self._held.clear()
-            self._transport.write(content)
+            if not self._transport.is_closing():  # else the caller has left
+                self._transport.write(content)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
