@@ -125,16 +125,16 @@ Content-Length: {len(body)}
 
 
 def test_trailers_are_no_headers(server: RunningServer) -> None:
-    """A field after the body takes no part in who asks and what is asked: whoever checked the head saw none."""
-    head = f"""POST /v1/specs/validate HTTP/1.1
-Host: {{host}}
+    """A field after the body takes no part in who asks and what is asked: who checked the head saw none."""
+    head = """POST /v1/specs/validate HTTP/1.1
+Host: {host}
 Content-Type: application/json
 Transfer-Encoding: chunked
 
 2
-{{{{}}}}
+{{}}
 0
-Host: {{trailer}}
+Host: {trailer}
 X-Request-ID: of-a-trailer
 
 """.replace("\n", "\r\n")

@@ -186,6 +186,36 @@ def test_a_caller_who_does_not_read_holds_up_nobody(server, begin):
     asyncio.run(scene())
 
 
+def test_messages_that_never_end_take_no_more_than_all_bodies_may(tmp_path):
+    """What is over the limit on all of them together is let go, and steps are decided as before."""
+    with (
+        serving(tmp_path, SPECSHIELD_MAX_BODIES_BYTES=str(2 << 20)) as server,
+        ShieldClient(server.url, timeout=HUNG) as client,
+        ExitStack() as opened,
+    ):
+        session = client.sessions.create(policy_id="case1", initial_pose=(5.0, 5.0, 0.0))
+        address = stream_of(server, {"id": session.id})
+        streams = [opened.enter_context(connect(address, ping_interval=None)) for _ in range(4)]
+        for stream in streams:
+            stream.socket.sendall(b"\x01\xff" + (900_000).to_bytes(8, "big") + bytes(4) + b" " * 800_000)
+
+        def let_go(stream):
+            with suppress(TimeoutError, ConnectionClosed):
+                stream.recv(timeout=0)
+            return stream.close_code == 1013
+
+        wait_for(lambda: sum(map(let_go, streams)) == 2)
+        session.step((5.0, 5.0, 0.0), [0.0] * 20)
+
+
+def test_a_message_in_fragments_is_one_message(server, begin):
+    sent = json.dumps(body(0))
+    with connect(stream_of(server, begin())) as stream, connect(stream_of(server, begin())) as other:
+        stream.send(iter(sent))  # each character is a fragment
+        other.send(sent)
+        assert json.loads(stream.recv()) == json.loads(other.recv())
+
+
 PING, EMPTY, STEP = b"\x89\x80" + bytes(4), b"\x00\x80" + bytes(4), b"\x81\x82" + bytes(4) + b"{}"
 
 

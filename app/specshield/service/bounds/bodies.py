@@ -20,13 +20,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from specshield.errors import BodyTooLarge, Busy, InputError, RequestTimeout, SpecshieldError
 from specshield.service import problems
 from specshield.service.access.site import UPLOADS
-from specshield.service.bounds.protocol import ARRIVED
+from specshield.service.bounds.protocol import ARRIVED, FREE
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings
 from specshield.service.storage.objects import unusable
 
 LONG = ("/steps", "/close", "/switch", "/validate")  # bodies with a history, or a formula with regions
-FREE = 64 << 10  # [bytes] of each body that the budget does not count, so that steps are always taken
 IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they are written to its file
 LONG_JSON = 16 << 10  # [bytes]; a shorter body has no room for many members
 
