@@ -242,6 +242,7 @@ class BoundedStream(WebSocketsSansIOProtocol):
             self.handle_parser_exception()  # sends that and closes
         if self.transport.is_closing():
             self._rest = b""
+            self._count(0)
             return
         if not self.queue.empty():  # `receive` goes on
             return
