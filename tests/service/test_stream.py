@@ -168,6 +168,15 @@ def test_text_that_is_no_text_ends_the_stream_and_writes_no_traceback(server, be
     assert "Traceback" not in server.log.read_text()
 
 
+def test_the_query_of_a_stream_is_not_logged(server, begin):
+    """A key that somebody puts there by mistake does not belong into a log."""
+    session = begin()
+    with connect(f"{stream_of(server, session)}?api_key=ss_secret"):
+        pass
+    wait_for(lambda: f"{session['id']}/stream" in server.log.read_text())
+    assert "ss_secret" not in server.log.read_text()
+
+
 def test_a_message_over_the_limit_ends_the_stream_and_no_other(server, begin):
     session, other = begin(), begin()
     with connect(stream_of(server, session)) as large, connect(stream_of(server, other)) as stream:
