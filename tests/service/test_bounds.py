@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -121,6 +122,41 @@ Content-Length: {len(body)}
             answered += (got := connection.recv(1 << 16))
             assert got, answered
         assert count == answered.count(b"HTTP/1.1 200 ") == 3
+
+
+def test_trailers_are_no_headers(server: RunningServer) -> None:
+    """A field after the body takes no part in who asks and what is asked: who checked the head saw none."""
+    head = """POST /v1/specs/validate HTTP/1.1
+Host: {host}
+Content-Type: application/json
+Transfer-Encoding: chunked
+
+2
+{{}}
+0
+Host: {trailer}
+X-Request-ID: of-a-trailer
+
+""".replace("\n", "\r\n")
+    own = urlsplit(server.url).netloc
+    for host, trailer, status in ((own, "evil.example", 422), ("evil.example", own, 421)):
+        with _connect(server) as connection:
+            connection.sendall(head.format(host=host, trailer=trailer).encode())
+            answer = HTTPResponse(connection)
+            answer.begin()
+        assert answer.status == status
+        assert answer.headers["X-Request-ID"] != "of-a-trailer"
+
+
+def test_a_caller_who_leaves_before_its_answer_writes_no_traceback(server: RunningServer) -> None:
+    """The connection is reset between the answer and its sending, in the next round of the event loop."""
+    request = f"GET /livez HTTP/1.1\r\nHost: {urlsplit(server.url).netloc}\r\n\r\n".encode()
+    for _ in range(100):
+        with _connect(server) as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # resets
+            connection.sendall(50 * request)
+    assert httpx.get(f"{server.url}/livez", timeout=HUNG, verify=False).status_code == 200
+    assert "Traceback" not in server.log.read_text()
 
 
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:

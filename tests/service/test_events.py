@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import os
 import signal
 import socket
+import sys
+import termios
 import threading
 import time
+from contextlib import ExitStack
 from typing import Any
+from urllib.parse import urlsplit
 
 import httpx
+import pytest
 import redis
 
 from specshield.service.sessions import record
@@ -116,6 +122,38 @@ def test_more_steps_than_are_kept_in_memory(server, client, begin, step):
     reader.join()
     assert [t for t, _ in reader.found] == [*range(150), END]
     assert [t for t, _ in read(server.url, session["id"], after=9)] == [*range(10, 150), END]
+
+
+@pytest.mark.parametrize("what", ["events?after=-1", "trajectory"])
+def test_many_who_read_a_long_session_at_once_hold_up_nobody(server, client, begin, step, what):
+    """Others get an answer after each bit of what they ask for, and not after a bit for each of them."""
+    session, pose = begin(max_steps=200), ahead(1)[0]
+    for t in range(150):
+        assert step(session, t, [pose]).status_code == 200
+    address = urlsplit(server.url)
+    request = f"GET /v1/sessions/{session['id']}/{what} HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode()
+    with ExitStack() as opened:
+        readers = [
+            opened.enter_context(socket.create_connection((address.hostname, address.port)))
+            for _ in range(100)
+        ]
+
+        def arrived() -> int:
+            count = bytearray(4)
+            return sum(
+                int.from_bytes(count, sys.byteorder)
+                for reader in readers
+                if not fcntl.ioctl(reader, termios.FIONREAD, count)
+            )
+
+        for reader in readers:
+            reader.sendall(request)
+        marks = [0]
+        while len(marks) < 50 or marks[-1] > marks[-30]:  # until nothing more comes
+            assert client.get("/livez").status_code == 200
+            marks.append(arrived())
+    assert marks[-1] > 5_000_000
+    assert len(marks) > 150, "answers meanwhile"
 
 
 def test_a_stream_ends_though_a_switch_passed_the_last_steps_over(server, client, begin, step):

@@ -310,7 +310,8 @@ def test_others_have_their_turn_while_a_long_trajectory_is_written(asked):
     async def scenario():
         task = asyncio.create_task(other())
         lines = (b'{"t":%d}' % t for t in range(1000))
-        parts = _each(lines) if asked == "ndjson" else _listed(lines, b"[]")
+        alone = asyncio.Lock()
+        parts = _each(lines, alone) if asked == "ndjson" else _listed(lines, b"[]", alone)
         content = b"".join([part async for part in parts])
         task.cancel()
         return content

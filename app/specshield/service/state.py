@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -50,6 +51,7 @@ class Server:
     keys: Keys
     pictures: Recent[bytes] = field(default_factory=lambda: Recent[bytes](PICTURES))  # of policies, by id
     streams: Streams = field(default_factory=Streams)
+    reading: asyncio.Lock = field(default_factory=asyncio.Lock)  # held for each line of a trajectory
 
 
 async def _server(request: Request) -> Server:

@@ -10,19 +10,23 @@ import asyncio
 import resource
 import socket
 import sys
+import time
 from functools import cache
 from typing import Any, cast
 
 import httptools
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import CloseCode, Frame
 
 from specshield.errors import Busy, HeadersTooLarge, InputError, RequestTimeout, SpecshieldError
 from specshield.service import metrics, problems
 from specshield.service.settings import Settings
 
 ARRIVED = "arrived"  # in `scope["state"]` once the whole request is here, so that no wait needs a limit
-PIECE = 2048  # [bytes]; chosen by hand: a step fits, and the pings that fit take some 5 ms
+PIECE = 2048  # [bytes]; chosen by hand: a step fits, and the pings that fit take some 1 to 5 ms
+SHARE = 0.001  # [s] of a round of the event loop for all streams together, or one piece. Chosen by hand.
+FREE = 64 << 10  # [bytes] of each body, or of a message of a stream, that count for no limit on all together
 AT_ONCE = 1 << 16  # [bytes] of an answer that are sent at once: waiting for more would gain nothing
 KEPT_FILES = 256  # file descriptors for the store, files and child processes
 
@@ -99,6 +103,8 @@ class BoundedProtocol(HttpToolsProtocol):
         self._in_head, self._head = True, 0
 
     def on_header(self, name: bytes, value: bytes) -> None:
+        if not self._in_head:  # a trailer: uvicorn would add it to the headers, which may be read already
+            return
         self._head += len(name) + len(value)
         if self._head > 2 * self._most:  # `data_received` may have counted the same bytes
             raise ValueError("the head is too large")  # ends the parsing: uvicorn calls `send_400_response`
@@ -179,22 +185,87 @@ class BoundedProtocol(HttpToolsProtocol):
 
 
 class BoundedStream(WebSocketsSansIOProtocol):
-    """Handles what arrived piece by piece, so that others can run: uvicorn takes 40,000 messages at once."""
+    """Handles what arrived piece by piece, so that others can run: uvicorn takes 40,000 messages at once.
 
+    The streams take turns: in a round of the event loop the pieces of all of them take about `SHARE`.
+    """
+
+    # The streams that have a piece to be handled, the first in line first. While there is one, `_take_turns`
+    # is called soon.
+    turns: dict[BoundedStream, None] = {}  # noqa: RUF012
     _rest = b""
+    _joined = bytearray()  # the fragments of a message so far
+    held = 0  # [bytes] of messages that have not come as a whole, of all streams
+    _held = 0  # of this one
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self.turns.pop(self, None)
+        self._count(0)
+        super().connection_lost(exc)
 
     def data_received(self, data: bytes = b"") -> None:
-        data = self._rest + data
-        self._rest = data[PIECE:]
+        if not self.handshake_initiated:  # this is the handshake
+            super().data_received(data)
+            return
+        self._rest += data
         if self.transport.is_closing():
             return
-        if not data:
+        if not self._rest:
             self.transport.resume_reading()
             return
         self.transport.pause_reading()
-        super().data_received(data[:PIECE])
-        if self.queue.empty():
-            self.loop.call_soon(self.data_received)
+        if not self.turns:
+            self.loop.call_soon(self._take_turns)
+        self.turns[self] = None
+
+    def _take_turns(self) -> None:
+        end = time.perf_counter() + SHARE
+        while self.turns:
+            stream = next(iter(self.turns))
+            del self.turns[stream]
+            stream._handle_piece()
+            if time.perf_counter() > end:
+                break
+        if self.turns:
+            self.loop.call_soon(self._take_turns)
+
+    def _handle_piece(self) -> None:
+        piece, self._rest = self._rest[:PIECE], self._rest[PIECE:]
+        super().data_received(piece)
+        self._count(sum(map(len, (self._rest, self.conn.reader.buffer, self._joined, *self.frames))))
+        if (
+            self._held
+            and BoundedStream.held > _settings().max_bodies_bytes
+            and not self.transport.is_closing()
+        ):
+            self.conn.fail(CloseCode.TRY_AGAIN_LATER, "the server cannot hold more bytes of messages now")
+            self.handle_parser_exception()  # sends that and closes
+        if self.transport.is_closing():
+            self._rest = b""
+            self._count(0)
+            return
+        if not self.queue.empty():  # `receive` goes on
+            return
+        if self._rest:
+            self.turns[self] = None
+        else:
+            self.transport.resume_reading()
+
+    def _count(self, size: int) -> None:
+        """Notes how much the stream holds, beyond what a usual step takes."""
+        held = max(size - FREE, 0)
+        BoundedStream.held += held - self._held
+        self._held = held
+
+    def handle_cont(self, event: Frame) -> None:
+        """Joins fragments as they come: uvicorn's list of a message of 1 MB in single bytes takes 100 MB."""
+        if self.frames:
+            self._joined = bytearray(self.frames.pop())
+        self._joined += event.data
+        if event.fin:
+            self.frames = [bytes(self._joined)]
+            self.send_receive_event_to_app()
+            self._joined = bytearray()
 
     def shutdown(self) -> None:
         """An open stream ends itself after the step that is being decided (`leaving.Streams`)."""
@@ -242,7 +313,8 @@ class Corked:
         if self._held:
             content = b"".join(self._held) if len(self._held) > 1 else self._held[0]
             self._held.clear()
-            self._transport.write(content)
+            if not self._transport.is_closing():  # else the caller has left
+                self._transport.write(content)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)

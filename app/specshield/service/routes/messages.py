@@ -11,9 +11,11 @@ from pydantic import ValidationError
 
 from specshield.errors import InputError, SpecshieldError
 from specshield.service import problems
+from specshield.service.bounds.bodies import check_items
 from specshield.service.schemas.steps import StepBody, StepRequest
 
 MSGPACK = "application/msgpack"
+SHORT = 64 << 10  # [bytes]; every wrong field of a shorter body is named, which takes a few ms
 
 _json, _msgpack = msgspec.json.Decoder(StepBody), msgspec.msgpack.Decoder(StepBody)
 _any = msgspec.msgpack.Decoder(ext_hook=lambda code, data: bytes(data))
@@ -24,9 +26,14 @@ def read_step(body: Any, packed: bool) -> StepBody:
     """body: bytes of MessagePack if `packed`, else JSON as bytes or as a text. Raises InputError, or its
     subclass for the wrong field.
     """
+    if not packed and len(body) > SHORT:
+        check_items(body)
     try:
         return (_msgpack if packed else _json).decode(body)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+    except msgspec.MsgspecError as error:
+        if len(body) > SHORT:
+            raise _in_short(str(error)) from None
+    except (UnicodeError, RecursionError):
         pass
     try:  # pydantic names every wrong field, msgspec only the first
         value = _any.decode(body) if packed else json.loads(body)
@@ -38,6 +45,14 @@ def read_step(body: Any, packed: bool) -> StepBody:
         name, expected = ("MessagePack", "a map") if packed else ("JSON", "a JSON object")
         reason = problems.UNREADABLE.get(type(error)) or getattr(error, "msg", str(error))
         raise InputError(f"the body is not {name}: {reason}", expected=expected) from None
+
+
+def _in_short(told: str) -> InputError:
+    """The error from msgspec's message about a body that would take too long to be read by pydantic."""
+    message, _, where = told.partition(" - at `$")
+    path = where.strip(".`") or "body"
+    kind = problems.FIELD_ERRORS.get(re.split(r"[.\[]", path)[0], InputError)
+    return kind(f"{path} is not valid: {message}", path=path, expected="a step as /docs describes it")
 
 
 def accepts(header: str, kind: str) -> bool:

@@ -190,8 +190,8 @@ async def trajectory(
     """The states x_0 to x_t with the answers, as one JSON object or as one JSON object in each line."""
     lines, rules = await server.sessions.trajectory(key)
     if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
-        return StreamingResponse(_each(lines), media_type=NDJSON)
-    return StreamingResponse(_listed(lines, rules), media_type="application/json")
+        return StreamingResponse(_each(lines, server.reading), media_type=NDJSON)
+    return StreamingResponse(_listed(lines, rules, server.reading), media_type="application/json")
 
 
 @router.get(
@@ -207,15 +207,22 @@ async def learned(key: SessionKey, server: ServerState) -> Response:
     return Response(await server.sessions.learned(key), media_type="application/json")
 
 
-async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
-    for line in lines:
+async def _each(lines: Iterator[bytes], turns: asyncio.Lock) -> AsyncIterator[bytes]:
+    """The lines. However many callers read, one is written in a round of the event loop: 10,000 lines take
+    more than a second.
+    """
+    while True:
+        async with turns:
+            line = next(lines, None)
+            await asyncio.sleep(0)
+        if line is None:
+            return
         yield line + b"\n"
-        await asyncio.sleep(0)  # lets other requests run: 10,000 lines take more than a second
 
 
-async def _listed(lines: Iterator[bytes], rules: bytes) -> AsyncIterator[bytes]:
+async def _listed(lines: Iterator[bytes], rules: bytes, turns: asyncio.Lock) -> AsyncIterator[bytes]:
     before = b'{"items":['
-    async for line in _each(lines):
+    async for line in _each(lines, turns):
         yield before + line
         before = b","
     yield b'],"next":null,"rules":' + rules + b"}"

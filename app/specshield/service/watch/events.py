@@ -51,6 +51,8 @@ class Watchers:
         self._store, self._limit, self._stopping, self._deciding = store, limit, stopping, deciding
         self._feeds: dict[str, Feed] = {}
         self._open = 0
+        # Of the streams that are behind, one at a time reads and writes older steps: that takes some ms.
+        self._reading = asyncio.Lock()
 
     async def run(self) -> None:
         """Looks for news of the watched sessions until it is cancelled."""
@@ -139,8 +141,9 @@ class Watchers:
                 told, changed = [], feeds[0].changed
                 behind = [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]
                 for feed, t in behind:
-                    found, t = await self._since(feed, t)
-                    told += [each.whole if several else each.event for each in found]
+                    async with self._reading if t < feed.start else contextlib.nullcontext():
+                        found, t = await self._since(feed, t)
+                        told += [each.whole if several else each.event for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
                         told.append(feed.last(several))
@@ -233,6 +236,7 @@ class Watchers:
         """Decisions from step t on, and the step that follows them. Older ones are read from the store."""
         if t >= feed.start:
             return feed.since(t), max(t, feed.end)
+        await self._idle()
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)

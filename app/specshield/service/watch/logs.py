@@ -55,6 +55,9 @@ def config(form: str, level: str) -> dict[str, Any]:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
+    if str(record.msg).startswith('%s - "WebSocket %s"') and isinstance(record.args, tuple):
+        client, path, *others = record.args
+        record.args = client, str(path).partition("?")[0], *others  # a caller may put its key into the query
     return record.getMessage() not in NO_NEWS
 
 
