@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -91,6 +94,42 @@ def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> Non
         assert pool.children == 1
 
     run(scenario)
+
+
+# A template that can fork at its first and third try.
+FULL_AT_TIMES = """
+import os, socket
+from specshield.service.heavy import child
+fork, tries = os.fork, []
+def fork_or_not():
+    tries.append(None)
+    if len(tries) == 2:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+    return fork()
+os.fork = fork_or_not
+child.template(socket.socket(fileno=os.dup(0)))
+"""
+
+
+def test_where_no_child_can_be_begun_the_caller_is_told_so_and_other_calls_go_on() -> None:
+    async def scenario(pool: Pool) -> None:
+        pool.template._control, theirs = socket.socketpair()
+        with theirs:
+            pool.template._process = subprocess.Popen([sys.executable, "-c", FULL_AT_TIMES], stdin=theirs)
+        long = asyncio.create_task(pool.run("time:sleep", 600.0, seconds=600.0))
+        await asyncio.to_thread(wait_for, lambda: pool.children and children(pool.template._process.pid))
+        with pytest.raises(Busy):
+            await pool.run("math:sqrt", 9.0, seconds=60.0)
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+        assert not long.done()
+        assert pool.children == 2
+
+        pool.template._process.kill()
+        with pytest.raises(Busy):  # it was not too expensive
+            await long
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+
+    run(scenario, size=2)
 
 
 def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFixture[str]) -> None:
