@@ -3,7 +3,7 @@
     python -m specshield.service.heavy.child     # the template; standard input is a socket from the server
 
 The template forks for each message from the server, which has a socket attached. A fork takes 10 ms, while
-importing the core takes a second. The fork serves calls on its socket, one after the other. Where the template
+importing the core takes a second. The fork serves calls on its socket, one after the other. If the template
 cannot fork, it says so on that socket, and goes on. Each process ends when the server closes its socket or
 ends.
 """
