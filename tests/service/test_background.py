@@ -1,9 +1,11 @@
+import asyncio
 import subprocess
 import sys
 from concurrent.futures import Future
 
 import pytest
 
+from specshield.service import app
 from specshield.service.heavy.background import Background
 from tests.serving import HUNG
 
@@ -18,6 +20,20 @@ def test_calls_are_made_in_turn_and_their_errors_are_told():
     assert (first.result(), second.result()) == (1, 2)
     with pytest.raises(ZeroDivisionError):
         wrong.result()
+
+
+def test_a_task_of_the_server_that_fails_is_told_in_the_log_and_begun_again(caplog, monkeypatch):
+    begun = []
+
+    async def task():
+        begun.append(None)
+        if len(begun) == 1:
+            raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(app, "AGAIN", 0.0)
+    asyncio.run(app.lasting(task))
+    assert len(begun) == 2
+    assert "can't start new thread" in caplog.text
 
 
 def test_a_program_that_ends_does_not_wait_for_a_call():
