@@ -5,8 +5,10 @@ from concurrent.futures import Future
 
 import pytest
 
+from specshield.errors import InsufficientStorage
 from specshield.service import app
 from specshield.service.heavy.background import Background
+from specshield.service.startup import Startup, prepare
 from tests.serving import HUNG
 
 
@@ -34,6 +36,20 @@ def test_a_task_of_the_server_that_fails_is_told_in_the_log_and_begun_again(capl
     asyncio.run(app.lasting(task))
     assert len(begun) == 2
     assert "can't start new thread" in caplog.text
+
+
+def test_a_server_becomes_ready_once_what_kept_it_from_that_has_passed(monkeypatch):
+    startup, told = Startup(), []
+
+    def check():
+        told.append(startup.problem().message)
+        if len(told) == 1:
+            raise InsufficientStorage("the server's disk is full")
+
+    monkeypatch.setattr(app, "AGAIN", 0.0)
+    asyncio.run(app.lasting(lambda: prepare(startup, check)))
+    assert startup.ready
+    assert told[1] == "the server cannot become ready now: InsufficientStorage; its log says more"
 
 
 def test_a_program_that_ends_does_not_wait_for_a_call():

@@ -44,7 +44,7 @@ from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
-AGAIN = 1.0  # [s] until a task of the server that has ended with an error is begun again
+AGAIN = 2.0  # [s] until a task of the server that has ended with an error is begun again
 log = logging.getLogger("specshield")
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
@@ -139,7 +139,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     app.state.server = server
     heed_signals(startup, server.streams, settings.drain)
     running = (
-        prepare(startup, check),
+        lasting(lambda: prepare(startup, check)),
         *([complete(startup)] if settings.complete else []),
         lasting(lambda: tend(embedded, worker, startup)),
         *map(lasting, (mover.run, watchers.run, keys.follow)),
@@ -162,8 +162,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
 
 
 async def lasting(begin: Callable[[], Awaitable[None]]) -> None:
-    """Does what a server needs for as long as it runs. After an error, as when no thread can be started for
-    it, it is begun again.
+    """Does what a server needs until that is done, if it ever is. After an error, as when no thread can be
+    started for it, it is begun again.
     """
     while True:
         try:
