@@ -84,6 +84,17 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
     asyncio.run(_ends(left))
 
 
+def test_a_child_that_was_stopped_ends_when_its_time_is_over() -> None:
+    async def scenario(pool: Pool) -> None:
+        pid: int = await pool.run("os:getpid", seconds=60.0)
+        os.kill(pid, signal.SIGSTOP)
+        with pytest.raises(TooExpensive):
+            await pool.run("math:sqrt", 9.0, seconds=0.2)
+        await _ends(pid)
+
+    run(scenario)
+
+
 def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> None:
     async def scenario(pool: Pool) -> None:
         pid: int = await pool.run("os:getpid", seconds=60.0)

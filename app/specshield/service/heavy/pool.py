@@ -99,6 +99,7 @@ class _Child:
         if not self.reader.at_eof():  # the child still runs, so that the process id is its own
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGTERM)
+                os.kill(self.pid, signal.SIGCONT)  # if it was stopped, it ends only now
         self.writer.close()
 
 
