@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -136,11 +137,22 @@ def test_where_no_child_can_be_begun_the_caller_is_told_so_and_other_calls_go_on
         assert pool.children == 2
 
         pool.template._process.kill()
-        with pytest.raises(Busy):  # it was not too expensive
-            await long
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+        assert not long.done()  # it was not too expensive, and is made once more
+        long.cancel()
+        await asyncio.gather(long, return_exceptions=True)
 
     run(scenario, size=2)
+
+
+def test_a_call_whose_child_was_killed_is_made_once_more(tmp_path: Path) -> None:
+    once = f"mkdir {tmp_path / 'first'} 2> /dev/null && kill -9 $PPID; exit 3"
+
+    async def scenario(pool: Pool) -> None:
+        assert await pool.run("subprocess:call", ["sh", "-c", once], seconds=60.0) == 3
+        assert pool.children == 1
+
+    run(scenario)
 
 
 def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFixture[str]) -> None:

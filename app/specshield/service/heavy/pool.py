@@ -29,6 +29,7 @@ from specshield.service.heavy.child import LENGTH, LIMITS, NOT_BEGUN
 # Chosen by hand; `python -m benchmarks.attacks` shows their effect.
 STARTS_WITHIN = 60  # [s] that a process may take to import everything on a busy machine
 MAY_GROW = 64 << 20  # [bytes] of additional memory after a call with which a child is not kept
+ENDED = asyncio.IncompleteReadError, ConnectionError  # raised for a process that has ended
 log = logging.getLogger("specshield")
 
 
@@ -178,12 +179,19 @@ class Pool:
         """The result of "module:function" in a child. A SpecshieldError of the function is raised here.
 
         seconds: the time limit, without the time of waiting. key: calls with the same key go to the same
-        child if it is free, for what it has kept. Raises Busy if the owner has too many waiting calls,
-        TooExpensive for a call that takes too much time or memory. Cancelling this call kills the child.
+        child if it is free, for what it has kept. A call whose child ends is made once more. Raises Busy if
+        the owner has too many waiting calls, TooExpensive for a call that takes too much time or memory.
+        Cancelling this call kills the child.
         """
         await self._turns.take(owner)
         try:
+            with contextlib.suppress(*ENDED):  # it may have been killed for the memory that others take
+                return await self._run(function, arguments, seconds, key)
             return await self._run(function, arguments, seconds, key)
+        except ENDED:
+            if not self.template.runs():  # with it all children end, and none of their calls is to blame
+                raise _none_to_do_it() from None
+            raise _too_expensive("the process that worked on it ended") from None
         finally:
             self._turns.give()
 
@@ -196,10 +204,6 @@ class Pool:
             keep = resident < child.floor + MAY_GROW
         except TimeoutError:
             raise _too_expensive(f"it took more than {seconds:g} s") from None
-        except (asyncio.IncompleteReadError, ConnectionError):
-            if not self.template.runs():  # with it all children end, and none of their calls is to blame
-                raise _none_to_do_it() from None
-            raise _too_expensive("the process that worked on it ended") from None
         finally:
             child.key, child.since = key, time.monotonic()
             if not keep:
@@ -237,7 +241,7 @@ class Pool:
             return await self._fork()
         except TimeoutError:  # an OSError too, so it comes first
             self.template.stop()  # it hangs, and nobody would get a child
-        except (ConnectionError, asyncio.IncompleteReadError):
+        except ENDED:
             pass  # the template may have died since the last child; it is begun anew where it has
         except OSError as error:
             log.warning("a process for heavy work cannot be begun: %s", error)
