@@ -439,6 +439,7 @@ def test_of_an_archive_that_is_away_nothing_is_known_to_be_absent(url, tmp_path,
         for id in ("robot", "erased"):
             await begin(store, id, 3)
             assert await store.put_away(id, time.time() + TTL, dump := await store.dump(id))
+        await begin(store, "running", 3)
         folder.rename(aside)
         if instead == "a file":
             folder.touch()
@@ -448,6 +449,7 @@ def test_of_an_archive_that_is_away_nothing_is_known_to_be_absent(url, tmp_path,
             lambda: begin(store, "robot", 3),
             lambda: store.everything("", None, 10),
             lambda: store.delete("erased"),
+            lambda: store.delete("running"),
             lambda: Mover(store, Settings()).sweep(),
         ):
             with pytest.raises(StoreError, match="files cannot be used"):
@@ -456,6 +458,7 @@ def test_of_an_archive_that_is_away_nothing_is_known_to_be_absent(url, tmp_path,
             folder.unlink()
         aside.rename(folder)
         assert (await store.dump("robot")).steps == dump.steps
+        assert await store.dump("running")
         assert await store.delete("erased")
         assert not archive.entries("erased")
 
