@@ -1,5 +1,7 @@
 """Tables for a session's own map."""
 
+import threading
+
 import numpy as np
 
 from evaluation.shipped import shipped
@@ -22,6 +24,19 @@ def test_a_session_goes_on_without_tables_that_cannot_be_made_and_does_not_try_a
         for _ in range(2):
             assert tables.of("a session", shield, known) == (shield, None)
             assert tables._last.peek("a session") == begun
+
+
+def test_a_step_does_without_tables_while_no_thread_can_be_started(monkeypatch):
+    shield, tables = make_shield([shipped(load_case("case1"), "reachability")]), Tables()
+    known = LearnedMap(1, np.array([0]), np.array([True]), np.array([0]), np.array([0]))
+
+    def none_left(thread):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", none_left)
+        assert tables.of("a session", shield, known) == (shield, None)
+    wait_for(lambda: tables.of("a session", shield, known)[1] == known.digest)
 
 
 def test_tables_take_no_more_memory_than_they_may_and_are_not_made_in_circles(monkeypatch):

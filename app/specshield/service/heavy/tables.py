@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
 from operator import attrgetter
 from typing import NamedTuple
@@ -66,7 +67,8 @@ class Tables:
             return shield, None
         wanted, last = (known.digest, _ids(shield)), self._last.peek(session)
         if last is None or (last[0] != wanted and last[1].done()):
-            self._last.put(session, (wanted, self._threads.submit(self._make, session, shield, known)))
+            with suppress(RuntimeError):  # no thread can be started just now: the next step tries again
+                self._last.put(session, (wanted, self._threads.submit(self._make, session, shield, known)))
         newest = self._newest.peek(session)
         if newest is None or newest.policies != _ids(shield):  # of an earlier rule
             return shield, None
