@@ -413,14 +413,14 @@ def test_files_that_are_away_are_told_as_a_store_that_is(tmp_path, gone):
             return client.post("/v1/maps", json=other)
 
         folder.resolve().rename(tmp_path / "away")
-        known = f"/v1/policies/{begun['policy_id']}" if gone == "policies" else f"/v1/maps/{kept}"
-        for method in ("GET", "DELETE"):  # it is not said to be absent, nor to be removed
-            problem(client.request(method, known), 503, "store-unavailable")
         detail = problem(sent(), 503, "store-unavailable")["detail"]
         assert detail == "the server's files cannot be used: No such file or directory"
         if gone != ".":  # else the embedded store is away too
             step = {"t": 0, "poses": [START], "logits": LOGITS}
             assert client.post(f"/v1/sessions/{session['id']}/steps", json=step).status_code == 200
+        known = f"/v1/policies/{begun['policy_id']}" if gone == "policies" else f"/v1/maps/{kept}"
+        for method in ("GET", "DELETE"):  # it is not said to be absent, nor to be removed
+            problem(client.request(method, known), 503, "store-unavailable")
         (tmp_path / "away").rename(folder.resolve())
         assert client.get(known).status_code == 200
         assert sent().status_code in (201, 202)
