@@ -175,7 +175,7 @@ ATTACKS: dict[str, Callable[[str], None]] = {
         connections, headers, half_bodies,
     )
 }  # fmt: skip
-# Robots, not attacks. What they take of the memory is kept: tables of 64 sessions (service/heavy/tables.py).
+# Robots, not attacks. What they take of the memory is kept: 256 MiB of tables (service/heavy/tables.py).
 ROBOTS: dict[str, Callable[[str], None]] = {changing_maps.__name__: changing_maps}
 ALL = {**ATTACKS, **ROBOTS}
 

@@ -428,6 +428,44 @@ def test_a_file_that_was_left_half_written_does_not_stand_for_the_session(url, a
     run(url, archive, story)
 
 
+@pytest.mark.parametrize("instead", ["nothing", "a file"])
+def test_of_an_archive_that_is_away_nothing_is_known_to_be_absent(url, tmp_path, instead):
+    """As where a network folder is not mounted. An archived session was said to have expired, which a robot
+    takes for the end; and one that was erased came back with the folder.
+    """
+    folder, aside = tmp_path / "archive", tmp_path / "aside"
+
+    async def story(store):
+        for id in ("robot", "erased"):
+            await begin(store, id, 3)
+            assert await store.put_away(id, time.time() + TTL, dump := await store.dump(id))
+        await begin(store, "running", 3)
+        folder.rename(aside)
+        if instead == "a file":
+            folder.touch()
+        for asked in (
+            lambda: store.load("robot"),
+            lambda: store.dump("robot"),
+            lambda: begin(store, "robot", 3),
+            lambda: store.everything("", None, 10),
+            lambda: store.delete("erased"),
+            lambda: store.delete("running"),
+            lambda: Mover(store, Settings()).sweep(),
+        ):
+            with pytest.raises(StoreError, match="files cannot be used"):
+                await asked()
+        if instead == "a file":
+            folder.unlink()
+        aside.rename(folder)
+        assert (await store.dump("robot")).steps == dump.steps
+        assert await store.dump("running")
+        assert await store.delete("erased")
+        assert not archive.entries("erased")
+
+    archive = Archive(open_objects(str(folder)))
+    run(url, archive, story)
+
+
 def test_links_and_copies_among_the_files_keep_no_sweep_from_its_end(url, tmp_path, caplog):
     archive = Archive(open_objects(str(tmp_path)))
     left_out.cache_clear()

@@ -5,8 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -81,6 +85,17 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
     asyncio.run(_ends(left))
 
 
+def test_a_child_that_was_stopped_ends_when_its_time_is_over() -> None:
+    async def scenario(pool: Pool) -> None:
+        pid: int = await pool.run("os:getpid", seconds=60.0)
+        os.kill(pid, signal.SIGSTOP)
+        with pytest.raises(TooExpensive):
+            await pool.run("math:sqrt", 9.0, seconds=0.2)
+        await _ends(pid)
+
+    run(scenario)
+
+
 def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> None:
     async def scenario(pool: Pool) -> None:
         pid: int = await pool.run("os:getpid", seconds=60.0)
@@ -88,6 +103,53 @@ def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> Non
         await _ends(pid)
         await asyncio.sleep(0.1)  # the event loop hears of it
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0  # and it is not called too expensive
+        assert pool.children == 1
+
+    run(scenario)
+
+
+# A template that can fork at its first and third try.
+FULL_AT_TIMES = """
+import os, socket
+from specshield.service.heavy import child
+fork, tries = os.fork, []
+def fork_or_not():
+    tries.append(None)
+    if len(tries) == 2:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+    return fork()
+os.fork = fork_or_not
+child.template(socket.socket(fileno=os.dup(0)))
+"""
+
+
+def test_where_no_child_can_be_begun_the_caller_is_told_so_and_other_calls_go_on() -> None:
+    async def scenario(pool: Pool) -> None:
+        pool.template._control, theirs = socket.socketpair()
+        with theirs:
+            pool.template._process = subprocess.Popen([sys.executable, "-c", FULL_AT_TIMES], stdin=theirs)
+        long = asyncio.create_task(pool.run("time:sleep", 600.0, seconds=600.0))
+        await asyncio.to_thread(wait_for, lambda: pool.children and children(pool.template._process.pid))
+        with pytest.raises(Busy):
+            await pool.run("math:sqrt", 9.0, seconds=60.0)
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+        assert not long.done()
+        assert pool.children == 2
+
+        pool.template._process.kill()
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+        assert not long.done()  # it was not too expensive, and is made once more
+        long.cancel()
+        await asyncio.gather(long, return_exceptions=True)
+
+    run(scenario, size=2)
+
+
+def test_a_call_whose_child_was_killed_is_made_once_more(tmp_path: Path) -> None:
+    once = f"mkdir {tmp_path / 'first'} 2> /dev/null && kill -9 $PPID; exit 3"
+
+    async def scenario(pool: Pool) -> None:
+        assert await pool.run("subprocess:call", ["sh", "-c", once], seconds=60.0) == 3
         assert pool.children == 1
 
     run(scenario)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from contextlib import ExitStack
 from datetime import datetime, timedelta, timezone
@@ -16,11 +17,12 @@ from rq.serializers import JSONSerializer
 
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.training import worker
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, _alive
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import children, command_line, free_port, runs, serving, wait_for
+from tests.serving import HUNG, children, command_line, free_port, runs, serving, wait_for
 from tests.stores import DURABLE, answers, running
 
 pytest.importorskip("torch")
@@ -282,6 +284,19 @@ def test_a_worker_whose_heartbeat_finds_the_store_away_goes_on(tmp_path):
         wait_for(lambda: answers(node))
         worker.maintain_heartbeats(job, execution)
         assert node.ttl(worker.key) > 0
+
+
+def test_a_worker_goes_on_showing_that_it_lives_after_a_process_could_not_be_begun(monkeypatch):
+    """Else no policy would be made until somebody starts another worker."""
+    shown = threading.Semaphore(0)
+
+    def live():
+        shown.release()
+        raise BlockingIOError(11, "Resource temporarily unavailable")  # as of Popen
+
+    monkeypatch.setattr(worker, "SIGN_OF_LIFE", 0.05)
+    with worker._regularly(live):
+        assert all(shown.acquire(timeout=HUNG) for _ in range(3))
 
 
 def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(orphaned):

@@ -403,7 +403,7 @@ def test_files_that_are_away_are_told_as_a_store_that_is(tmp_path, gone):
         serving(tmp_path / "data") as server,
         httpx.Client(base_url=server.url, timeout=None, verify=False) as client,
     ):
-        assert client.post("/v1/maps", json=grid_json()).status_code == 201
+        kept = client.post("/v1/maps", json=grid_json()).json()["id"]
         begun = {"policy_id": send_policy(client)["id"], "initial_pose": START}
         session = client.post("/v1/sessions", json=begun).json()
 
@@ -418,7 +418,11 @@ def test_files_that_are_away_are_told_as_a_store_that_is(tmp_path, gone):
         if gone != ".":  # else the embedded store is away too
             step = {"t": 0, "poses": [START], "logits": LOGITS}
             assert client.post(f"/v1/sessions/{session['id']}/steps", json=step).status_code == 200
+        known = f"/v1/policies/{begun['policy_id']}" if gone == "policies" else f"/v1/maps/{kept}"
+        for method in ("GET", "DELETE"):  # it is not said to be absent, nor to be removed
+            problem(client.request(method, known), 503, "store-unavailable")
         (tmp_path / "away").rename(folder.resolve())
+        assert client.get(known).status_code == 200
         assert sent().status_code in (201, 202)
 
 

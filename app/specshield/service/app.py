@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import multiprocessing
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
@@ -44,6 +44,7 @@ from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
+AGAIN = 2.0  # [s] until a task of the server that has ended with an error is begun again
 log = logging.getLogger("specshield")
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
@@ -138,12 +139,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     app.state.server = server
     heed_signals(startup, server.streams, settings.drain)
     running = (
-        prepare(startup, check),
+        lasting(lambda: prepare(startup, check)),
         *([complete(startup)] if settings.complete else []),
-        tend(embedded, worker, startup),
-        mover.run(),
-        watchers.run(),
-        keys.follow(),
+        lasting(lambda: tend(embedded, worker, startup)),
+        *map(lasting, (mover.run, watchers.run, keys.follow)),
     )
     tasks = [asyncio.create_task(each) for each in running]
     try:
@@ -160,3 +159,15 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await store.aclose()
         if embedded is not None:
             embedded.leave()
+
+
+async def lasting(begin: Callable[[], Awaitable[None]]) -> None:
+    """Does what a server needs until that is done, if it ever is. After an error, as when no thread can be
+    started for it, it is begun again.
+    """
+    while True:
+        try:
+            return await begin()
+        except Exception:
+            log.exception("a task of the server ended; it is begun again")
+        await asyncio.sleep(AGAIN)

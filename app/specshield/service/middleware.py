@@ -55,10 +55,13 @@ class Observe:
 
         try:
             await self.app(scope, receive, answer)
-        except Exception:
+        except Exception as error:
+            told = problems.known(error)
             if not begun:
-                await problems.failed()(scope, receive, answer)
-            raise
+                response = problems.failed() if told is None else problems.tell(scope, told)
+                await response(scope, receive, answer)
+            if begun or told is None:
+                raise
         finally:
             status = scope["state"].get("status", status)  # set if the caller has left
             route = getattr(scope.get("route"), "path", "other")

@@ -133,6 +133,20 @@ class ProblemResponse(Response):
         await super().__call__(scope, receive, send)
 
 
+def known(error: Exception) -> SpecshieldError | None:
+    """What callers are told of an error, None for one that nobody has foreseen. Where the machine lacks
+    something, such as room on its disk or a thread, they may ask again.
+    """
+    if isinstance(error, SpecshieldError):
+        return error
+    lost = isinstance(error, ConnectionError | TimeoutError)
+    if isinstance(error, OSError) and error.strerror is not None and not lost:
+        return unusable(error)
+    if isinstance(error, RuntimeError) and str(error) == "can't start new thread":
+        return errors.Busy("the server can start no thread just now", expected="the request again in a while")
+    return None
+
+
 def failed() -> Response:
     """The answer after an unexpected error. The error is also raised again, so that uvicorn logs the
     traceback and closes the connection: the header tells the caller that.
@@ -262,7 +276,7 @@ def install(app: FastAPI) -> None:
     from fastapi.exceptions import RequestValidationError  # the processes for heavy work need no FastAPI
 
     @app.exception_handler(SpecshieldError)
-    async def known(request: Request, error: SpecshieldError) -> Response:
+    async def ours(request: Request, error: SpecshieldError) -> Response:
         return tell(request.scope, error)
 
     @app.exception_handler(RequestValidationError)
@@ -293,10 +307,11 @@ def install(app: FastAPI) -> None:
         return Response(status_code=CLIENT_GONE)  # nobody reads it
 
     @app.exception_handler(OSError)
-    async def disk(request: Request, error: OSError) -> Response:
-        if error.strerror is None or isinstance(error, ConnectionError | TimeoutError):
+    @app.exception_handler(RuntimeError)
+    async def passing(request: Request, error: Exception) -> Response:
+        if (told := known(error)) is None:
             raise error
-        return tell(request.scope, unusable(error))
+        return tell(request.scope, told)
 
     @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:

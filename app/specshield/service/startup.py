@@ -149,7 +149,8 @@ async def until_it_may_listen(startup: Startup, prepared: asyncio.Task[Any]) -> 
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
-    """Returns when the server is ready, or cannot become ready.
+    """Returns when the server is ready, or cannot become ready with its settings. Raises what keeps it from
+    that now, such as a lack of processes, and may pass.
 
     check: raises what keeps the server from serving, or StoreError while that is not known. It blocks.
     """
@@ -183,8 +184,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         log.error("%s", error)
         startup.failure = str(error)
     except Exception as error:
-        log.exception("the kernels cannot be compiled")
-        startup.failure = f"the kernels cannot be compiled: {type(error).__name__}; see the server's log"
+        startup.failure = f"the server cannot become ready now: {type(error).__name__}; its log says more"
+        raise
 
 
 async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
@@ -260,7 +261,10 @@ async def _one_at_a_time(path: Path) -> AsyncIterator[None]:
 def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     startup = Startup()
-    asyncio.run(prepare(startup))
+    try:
+        asyncio.run(prepare(startup))
+    except Exception:
+        log.exception("the kernels cannot be compiled")
     if startup.ready and not asyncio.run(complete(startup, cores(), 0)):
         sys.exit("some kernels are not compiled; the lines above say why")
     sys.exit(startup.failure)

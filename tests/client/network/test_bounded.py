@@ -10,7 +10,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import httpx
 import pytest
 
+from specshield.client import AsyncShieldClient, ShieldClient
 from specshield.client.network import bounded
+from specshield.client.wire import Request
 from tests.serving import HUNG, wait_for
 
 
@@ -85,6 +87,29 @@ def test_another_event_loop_opens_connections_of_its_own():
     asyncio.run(client.aclose())  # in a third one, in which it has none
     server.shutdown()
     server.server_close()
+
+
+@pytest.mark.parametrize("stream", [False, True])
+def test_a_machine_without_a_thread_left_is_told_as_a_server_that_cannot_be_reached(monkeypatch, stream):
+    """Then `on_failure` holds. The error of Python's own went past it, and ended the robot's loop."""
+
+    def none_left(thread):
+        raise RuntimeError("can't start new thread")
+
+    async def ask(request):
+        async with AsyncShieldClient("http://localhost:1", stream=stream) as client:
+            with monkeypatch.context() as patch:
+                patch.setattr(threading.Thread, "start", none_left)
+                return await client._perform(request, math.inf)
+
+    for message in (None, {"t": 0}):
+        request = Request("POST", "/v1/sessions/a/steps", b"{}", message=message)
+        outcomes = [asyncio.run(ask(request))]
+        with ShieldClient("http://localhost:1", stream=stream) as client, monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", none_left)
+            outcomes.append(client._perform(request, math.inf))
+        for outcome in outcomes:
+            assert "can't start new thread" in str(outcome.error)
 
 
 def test_what_is_made_after_an_interrupt_is_given_to_be_left(monkeypatch):

@@ -142,7 +142,10 @@ def in_thread(
             given.set_exception(error)
 
     try:  # an interrupt may come while the thread is started, too
-        threading.Thread(target=run, daemon=True, name="specshield-client").start()
+        try:
+            threading.Thread(target=run, daemon=True, name="specshield-client").start()
+        except RuntimeError as error:  # the machine has no thread left
+            given.set_exception(OSError(str(error)))
         done = wait([given], max(by - time.monotonic(), 0.0)).done
     finally:
         if not done and late is not None:
@@ -180,7 +183,10 @@ class AsyncStream(_Around, httpcore.AsyncNetworkStream):
 
 class AsyncNetwork(httpcore.AnyIOBackend):
     async def connect_tcp(self, *args: Any, **options: Any) -> AsyncStream:
-        return AsyncStream(await super().connect_tcp(*args, **options))
+        try:
+            return AsyncStream(await super().connect_tcp(*args, **options))
+        except RuntimeError as error:  # the machine has no thread left, to look up the name
+            raise httpcore.ConnectError(str(error)) from error
 
 
 class Transport(httpx.HTTPTransport):

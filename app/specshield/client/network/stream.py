@@ -196,7 +196,10 @@ class AsyncStreams(Streams):
         if connection is None:
             for other in [kept for kept in list(self._open) if kept[0].is_closed()]:
                 self._open.pop(other, None)  # connections of earlier calls of asyncio.run
-            connection = await connect(**self._options(exchange)).__aenter__()
+            try:
+                connection = await connect(**self._options(exchange)).__aenter__()
+            except RuntimeError as error:  # the machine has no thread left, to look up the name
+                raise OSError(str(error)) from error
         try:
             await connection.send(message)
             reply = self._read(exchange, await connection.recv())

@@ -3,8 +3,9 @@
     python -m specshield.service.heavy.child     # the template; standard input is a socket from the server
 
 The template forks for each message from the server, which has a socket attached. A fork takes 10 ms, while
-importing the core takes a second. The fork serves calls on its socket, one after the other. Each process ends
-when the server closes its socket or ends.
+importing the core takes a second. The fork serves calls on its socket, one after the other. If the template
+cannot fork, it says so on that socket, and goes on. Each process ends when the server closes its socket or
+ends.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from specshield.service.watch import logs
 
 LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
 LENGTH = struct.Struct("<Q")
+NOT_BEGUN = (0, 0)  # the first word where there is no fork, in the place of its process id and its memory
 
 
 def template(control: socket.socket) -> None:
@@ -44,7 +46,14 @@ def template(control: socket.socket) -> None:
         message, descriptors, _, _ = socket.recv_fds(control, LIMITS.size, 1)
         if len(message) < LIMITS.size:
             return
-        if os.fork() == 0:
+        try:
+            pid = os.fork()
+        except OSError as error:  # no process or memory is left for it; those that run go on
+            logs.log.warning("a process for heavy work cannot be begun: %s", error)
+            with contextlib.suppress(ConnectionError), socket.socket(fileno=descriptors[0]) as calls:
+                write(calls.makefile("wb"), NOT_BEGUN)
+            continue
+        if pid == 0:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the server's parent may have had it ignored

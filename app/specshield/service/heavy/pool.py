@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import os
 import pickle
+import select
 import signal
 import socket
 import subprocess
@@ -22,11 +24,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from specshield.errors import Busy, ServerError, TooExpensive
-from specshield.service.heavy.child import LENGTH, LIMITS
+from specshield.service.heavy.child import LENGTH, LIMITS, NOT_BEGUN
 
 # Chosen by hand; `python -m benchmarks.attacks` shows their effect.
 STARTS_WITHIN = 60  # [s] that a process may take to import everything on a busy machine
 MAY_GROW = 64 << 20  # [bytes] of additional memory after a call with which a child is not kept
+ENDED = asyncio.IncompleteReadError, ConnectionError  # raised for a process that has ended
+log = logging.getLogger("specshield")
 
 
 class Template:
@@ -38,7 +42,7 @@ class Template:
 
     def fork(self, memory: int, nice: int) -> socket.socket:
         """The socket of a new child, which first sends its process id and its memory there."""
-        if self._process is None or self._process.poll() is not None:
+        if not self.runs():
             self.stop()
             self._control, theirs = socket.socketpair()
             with theirs:
@@ -54,6 +58,14 @@ class Template:
             socket.send_fds(self._control, [LIMITS.pack(memory, nice)], [theirs.fileno()])
         ours.setblocking(False)
         return ours
+
+    def runs(self) -> bool:
+        """Whether its process runs. A process that ends closes its sockets before its status is known."""
+        if self._control is None or self._process is None or self._process.poll() is not None:
+            return False
+        look = select.poll()
+        look.register(self._control, 0)
+        return not look.poll(0)
 
     def stop(self) -> None:
         if self._control is not None:
@@ -88,6 +100,7 @@ class _Child:
         if not self.reader.at_eof():  # the child still runs, so that the process id is its own
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGTERM)
+                os.kill(self.pid, signal.SIGCONT)  # if it was stopped, it ends only now
         self.writer.close()
 
 
@@ -166,12 +179,19 @@ class Pool:
         """The result of "module:function" in a child. A SpecshieldError of the function is raised here.
 
         seconds: the time limit, without the time of waiting. key: calls with the same key go to the same
-        child if it is free, for what it has kept. Raises Busy if the owner has too many waiting calls,
-        TooExpensive for a call that takes too much time or memory. Cancelling this call kills the child.
+        child if it is free, for what it has kept. A call whose child ends is made once more. Raises Busy if
+        the owner has too many waiting calls, TooExpensive for a call that takes too much time or memory.
+        Cancelling this call kills the child.
         """
         await self._turns.take(owner)
         try:
+            with contextlib.suppress(*ENDED):  # it may have been killed for the memory that others take
+                return await self._run(function, arguments, seconds, key)
             return await self._run(function, arguments, seconds, key)
+        except ENDED:
+            if not self.template.runs():  # with it all children end, and none of their calls is to blame
+                raise _none_to_do_it() from None
+            raise _too_expensive("the process that worked on it ended") from None
         finally:
             self._turns.give()
 
@@ -184,8 +204,6 @@ class Pool:
             keep = resident < child.floor + MAY_GROW
         except TimeoutError:
             raise _too_expensive(f"it took more than {seconds:g} s") from None
-        except (asyncio.IncompleteReadError, ConnectionError):
-            raise _too_expensive("the process that worked on it ended") from None
         finally:
             child.key, child.since = key, time.monotonic()
             if not keep:
@@ -221,22 +239,30 @@ class Pool:
     async def _start(self, again: bool = True) -> _Child:
         try:
             return await self._fork()
-        except (OSError, asyncio.IncompleteReadError) as error:
-            self.template.stop()
-            if again:  # the template may have died since the last child
-                return await self._start(again=False)
-            raise ServerError("a process for this does not start; the server's log says more") from error
+        except TimeoutError:  # an OSError too, so it comes first
+            self.template.stop()  # it hangs, and nobody would get a child
+        except ENDED:
+            pass  # the template may have died since the last child; it is begun anew where it has
+        except OSError as error:
+            log.warning("a process for heavy work cannot be begun: %s", error)
+            raise _none_to_do_it() from error
+        if again:
+            return await self._start(again=False)
+        raise ServerError("a process for this does not start; the server's log says more")
 
     async def _fork(self) -> _Child:
         ours = self.template.fork(self.memory, self.nice)
         reader, writer = await asyncio.open_connection(sock=ours)
         try:
             async with asyncio.timeout(STARTS_WITHIN):
-                pid, floor = await _read(reader)
-                return _Child(pid, floor, reader, writer)
+                pid, floor = begun = await _read(reader)
         except BaseException:
             writer.close()
             raise
+        if begun == NOT_BEGUN:
+            writer.close()
+            raise _none_to_do_it()
+        return _Child(pid, floor, reader, writer)
 
     def _let_go(self, child: _Child) -> None:
         child.kill()
@@ -270,3 +296,7 @@ def _too_expensive(reason: str) -> TooExpensive:
     return TooExpensive(
         f"the request is too expensive: {reason}", expected="one that takes less time and memory"
     )
+
+
+def _none_to_do_it() -> Busy:
+    return Busy("the server has no process for this just now", expected="the request again in a while")

@@ -10,8 +10,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import replace
+from operator import attrgetter
 from typing import NamedTuple
+
+import numpy as np
 
 from specshield.errors import SpecshieldError
 from specshield.service.heavy.background import Background
@@ -22,7 +26,8 @@ from specshield.world.learned import LearnedMap, applied
 from specshield.world.occupancy import OccupancyGrid
 
 log = logging.getLogger("specshield")
-ROOM = 64  # sessions whose tables are kept: about a megabyte each, more for a planner's fields. By hand.
+ROOM = 256 << 20  # [bytes] of tables that are kept: a session's take about 1 MB, or up to 100 for a planner
+SESSIONS = 1000  # for which it is known what was made last
 
 
 class Made(NamedTuple):
@@ -34,16 +39,23 @@ class Made(NamedTuple):
     policies: tuple[str, ...]
     proposers: tuple[Proposer, ...]
 
+    @property
+    def size(self) -> int:
+        """The bytes of the tables, about: those of the arrays that a policy holds."""
+        return sum(_bytes(vars(each)) for one in self.proposers if (each := getattr(one, "again", None)))
+
 
 class Tables:
     """The newest tables of each session. One thread makes them, for one session at a time; kernels run
-    without the interpreter's lock.
+    without the interpreter's lock. If too many sessions have tables, those that were used longest ago are let
+    go, and made again once their sessions learn something new.
     """
 
     def __init__(self) -> None:
         self._threads = Background("tables")
-        self._newest, self._making = files.Recent[Made](ROOM), files.Recent[tuple[bytes, Future[Made]]](ROOM)
-        self._failed = files.Recent[bytes](ROOM)  # the digest of the map for which no tables could be made
+        self._newest = files.Recent[Made](ROOM, attrgetter("size"))
+        # What they were last begun for, and when they are done.
+        self._last = files.Recent[tuple[object, Future[None]]](SESSIONS)
 
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
         """The shield with the newest tables of the session, and their digest, None if it has none yet. Also
@@ -53,24 +65,21 @@ class Tables:
         """
         if not len(known) or not any(hasattr(each, "remade") for each in shield.proposers):
             return shield, None
-        making = self._making.peek(session)
-        if making is not None and making[1].done():
-            self._making.drop(session)
-            if (error := making[1].exception()) is None:
-                self._newest.put(session, making[1].result())
-            else:  # the session goes on without them, as before they were made
-                self._failed.put(session, making[0])
-                log.warning("tables for a session's own map cannot be made: %r", error)
-            making = None
+        wanted, last = (known.digest, _ids(shield)), self._last.peek(session)
+        if last is None or (last[0] != wanted and last[1].done()):
+            with suppress(RuntimeError):  # no thread can be started just now: the next step tries again
+                self._last.put(session, (wanted, self._threads.submit(self._make, session, shield, known)))
         newest = self._newest.peek(session)
-        if newest is not None and newest.policies != _ids(shield):  # they are of an earlier rule
-            newest = None
-        have = self._failed.peek(session), None if newest is None else newest.digest
-        if making is None and known.digest not in have:
-            self._making.get(session, lambda: (known.digest, self._threads.submit(make, shield, known)))
-        if newest is None:
+        if newest is None or newest.policies != _ids(shield):  # of an earlier rule
             return shield, None
         return replace(shield, proposers=newest.proposers), newest.digest
+
+    def _make(self, session: str, shield: Shield, known: LearnedMap) -> None:
+        """A session whose tables cannot be made goes on without new ones."""
+        try:
+            self._newest.put(session, make(shield, known))
+        except Exception as error:
+            log.warning("tables for a session's own map cannot be made: %r", error)
 
 
 def make(shield: Shield, known: LearnedMap) -> Made:
@@ -93,3 +102,11 @@ def _remade(proposer: Proposer, grid: OccupancyGrid) -> Proposer:
 
 def _ids(shield: Shield) -> tuple[str, ...]:
     return tuple(each.id for each in shield.proposers)
+
+
+def _bytes(value: object) -> int:
+    """The bytes of all arrays in a value."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else ()
+    return sum(map(_bytes, parts))

@@ -149,18 +149,18 @@ class _Stream:
 
     async def _answer(self, content: bytes | str, packed: bool) -> tuple[int, bytes]:
         """The status that the answer has over HTTP, and the answer as a message."""
-        error: SpecshieldError
         try:
             api_key = await self._server.keys.check(self._authorization)  # the key may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
             request = read_step(content, packed)
             answer = await self._server.sessions.steps.decide(self._key, request, defaultdict(float))
             return 200, to_msgpack(answer) if packed else to_json(answer)
-        except SpecshieldError as known:
-            error = known
-            problems.tell(self._scope, error)
-        except Exception:
-            log.exception("a step of a stream failed")
-            error = ServerError("the server failed on this step; its log says more")
-        metrics.refused(error.type)
-        return problems.status_of(error), write_problem(error, packed)
+        except Exception as error:
+            told = problems.known(error)
+            if told is not None:
+                problems.tell(self._scope, told)
+            else:
+                log.exception("a step of a stream failed")
+                told = ServerError("the server failed on this step; its log says more")
+        metrics.refused(told.type)
+        return problems.status_of(told), write_problem(told, packed)

@@ -121,6 +121,7 @@ class ArchivingStore(Store):
 
     async def delete(self, id: str) -> bool:
         """Erases a session in store and archive. False if there was none."""
+        await self.in_thread(self.archive.entries, id)  # if the files are away, nothing is erased
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.take_off([id.encode()])

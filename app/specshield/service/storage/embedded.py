@@ -53,9 +53,10 @@ class EmbeddedStore:
         try:
             self._join()
         except OSError as error:
-            where = error.filename or self.folder
+            if error.filename is None:  # as where no process can be begun
+                raise StoreError(f"the embedded store cannot be started: {error.strerror}") from error
             raise StoreError(
-                f"the embedded store's folder cannot be used: {where}: {error.strerror}",
+                f"the embedded store's folder cannot be used: {error.filename}: {error.strerror}",
                 expected="a folder to write to",
             ) from error
 

@@ -50,7 +50,8 @@ def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, 
             try:
                 return method(*args, **kwargs)
             except OSError as error:
-                if absent is not None and (isinstance(error, ABSENT) or error.errno == ELOOP):
+                missing = isinstance(error, ABSENT) or error.errno == ELOOP
+                if absent is not None and missing and cast(Any, args[0]).there():
                     return cast(R, absent())
                 raise unusable(error) from error
 
@@ -75,6 +76,10 @@ class Folder:
     def __init__(self, root: Path) -> None:
         root.mkdir(parents=True, exist_ok=True)
         self.root = root
+
+    def there(self) -> bool:
+        """Whether the folder itself is there. If a network folder is away, no file is known to be absent."""
+        return os.path.isdir(self.root)
 
     @_reaching(absent=lambda: None)
     def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
@@ -108,6 +113,7 @@ class Folder:
     def remove(self, path: str) -> None:
         """Removes the file if it is there, and the folders that are empty then."""
         target = self.root / path
+        self.root.stat()  # fails if a network folder is away: its file would come back with it
         target.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # the folder is not empty, or gone already
             for folder in target.parents:
@@ -129,17 +135,16 @@ class Folder:
                 here.unlink()  # it is from a process that was killed
             elif here.is_symlink() and any(map(here.samefile, here.parents)):
                 left_out(f"{here} is left out: it is a link to a folder that it lies in")
-            elif S_ISDIR(about.st_mode):
+            elif S_ISDIR(about.st_mode) or not folder:
                 for found in sorted(here.iterdir()):
                     yield from self.sizes(found.relative_to(self.root).as_posix())
             elif not here.name.startswith("."):
                 yield folder, about.st_size
-        except FileNotFoundError:
-            return  # another process may remove it at any time
         except OSError as error:
-            if not folder:
+            if not folder or not self.there():
                 raise unusable(error) from error
-            left_out(f"{here} is left out: {error.strerror}")
+            if not isinstance(error, FileNotFoundError):  # another process may remove it at any time
+                left_out(f"{here} is left out: {error.strerror}")
 
 
 class Remote:
@@ -147,6 +152,10 @@ class Remote:
 
     def __init__(self, files: Any, root: str) -> None:
         self._files, self._root = files, root.rstrip("/")
+
+    def there(self) -> bool:
+        """As of `Folder`. Such a file system says by an error that it is away."""
+        return True
 
     @_reaching(absent=lambda: None)
     def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:

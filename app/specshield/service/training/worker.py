@@ -217,7 +217,7 @@ def _regularly(action: Callable[[], object]) -> Iterator[None]:
         while not over.is_set():
             try:
                 action()
-            except StoreError as error:
+            except (StoreError, OSError) as error:  # OSError: no process can be begun just now
                 log.warning("%s", error)
             over.wait(SIGN_OF_LIFE / 5)
 
