@@ -80,6 +80,21 @@ def test_a_request_without_a_host_is_misdirected(client):
     connection.close()
 
 
+@pytest.mark.parametrize("name", ["Host", "Origin", "Authorization", "Content-Type"])
+def test_a_header_that_says_who_may_do_what_comes_once(client, name):
+    """Else a proxy may judge by one of the two, and the server by the other."""
+    port = client.base_url.port
+    connection = http.client.HTTPConnection("127.0.0.1", port)
+    connection.putrequest("GET", "/v1/maps", skip_host=True)
+    for header in {"Host", name}:
+        for _ in range(1 + (header == name)):
+            connection.putheader(header, f"127.0.0.1:{port}")
+    connection.endheaders()
+    answer = connection.getresponse()
+    assert (answer.status, json.load(answer)["path"]) == (422, name)
+    connection.close()
+
+
 GRID = {"content": json.dumps(grid_json()).replace("0.1", "0.3")}
 FILES = {"files": {"metadata": ("map.yaml", YAML.replace(b"0.05", b"0.07")), "image": ("map.pgm", PGM)}}
 

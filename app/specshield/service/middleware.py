@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from specshield.errors import NotFound, SpecshieldError, Stopping
 from specshield.service import metrics, problems
 from specshield.service.access.keys import Rates
-from specshield.service.access.site import check_site
+from specshield.service.access.site import Headers, check_site, headers_of
 from specshield.service.routes.steps import STREAM
 from specshield.service.watch import logs
 
@@ -88,13 +88,13 @@ class Guard:
         if scope["type"] in ("http", "websocket"):
             scope.setdefault("state", {})
             try:
-                await self._check(scope, dict(scope["headers"]))
+                await self._check(scope, headers_of(scope["headers"]))
             except SpecshieldError as error:
                 await problems.ProblemResponse(error)(scope, receive, send)
                 return
         await self.app(scope, receive, send)
 
-    async def _check(self, scope: Scope, headers: dict[bytes, bytes]) -> None:
+    async def _check(self, scope: Scope, headers: Headers) -> None:
         check_site(scope, headers, self._allowed)
         path, server = scope["path"], scope["app"].state.server
         # A newline at the end has to be refused here: `$` in a route's pattern would match before it.

@@ -17,18 +17,33 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
-from specshield.errors import CrossSite, MisdirectedRequest, UnsupportedMediaType
+from specshield.errors import CrossSite, InputError, MisdirectedRequest, UnsupportedMediaType
 
 UPLOADS = ("/v1/maps", "/v1/policies")
 AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::([0-9]{1,5}))?", re.IGNORECASE)
 JSON = re.compile(r"application/(json|[a-z0-9!#$&^_.+-]+\+json)")
 WITH_BODY = ("POST", "PUT", "PATCH")
+ONCE = (b"host", b"origin", b"authorization", b"content-type")  # headers that say who may do what
 
 Headers = Mapping[bytes, bytes]  # names in lower case
+
+
+def headers_of(sent: Sequence[tuple[bytes, bytes]]) -> Headers:
+    """A request's headers by name. Raises InputError for two of one of `ONCE`: a proxy in front of the server
+    may have judged by the other one (RFC 9112, section 3.2).
+    """
+    headers = dict(sent)
+    if len(headers) < len(sent):
+        names = [name for name, _ in sent]
+        for name in ONCE:
+            if (count := names.count(name)) > 1:
+                told = name.decode().title()
+                raise InputError(f"the header {told} came {count} times", path=told, expected="it once")
+    return headers
 
 
 def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[str]) -> None:
