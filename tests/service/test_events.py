@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import json
 import os
 import signal
 import socket
-import sys
-import termios
 import threading
 import time
-from contextlib import ExitStack
 from typing import Any
-from urllib.parse import urlsplit
 
 import httpx
-import pytest
 import redis
 
+from specshield.service.routes.sessions import _each
 from specshield.service.sessions import record
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State
@@ -122,38 +117,6 @@ def test_more_steps_than_are_kept_in_memory(server, client, begin, step):
     reader.join()
     assert [t for t, _ in reader.found] == [*range(150), END]
     assert [t for t, _ in read(server.url, session["id"], after=9)] == [*range(10, 150), END]
-
-
-@pytest.mark.parametrize("what", ["events?after=-1", "trajectory"])
-def test_many_who_read_a_long_session_at_once_hold_up_nobody(server, client, begin, step, what):
-    """Others get an answer after each bit of what they ask for, and not after a bit for each of them."""
-    session, pose = begin(max_steps=200), ahead(1)[0]
-    for t in range(150):
-        assert step(session, t, [pose]).status_code == 200
-    address = urlsplit(server.url)
-    request = f"GET /v1/sessions/{session['id']}/{what} HTTP/1.1\r\nHost: {address.netloc}\r\n\r\n".encode()
-    with ExitStack() as opened:
-        readers = [
-            opened.enter_context(socket.create_connection((address.hostname, address.port)))
-            for _ in range(100)
-        ]
-
-        def arrived() -> int:
-            count = bytearray(4)
-            return sum(
-                int.from_bytes(count, sys.byteorder)
-                for reader in readers
-                if not fcntl.ioctl(reader, termios.FIONREAD, count)
-            )
-
-        for reader in readers:
-            reader.sendall(request)
-        marks = [0]
-        while len(marks) < 50 or marks[-1] > marks[-30]:  # until nothing more comes
-            assert client.get("/livez").status_code == 200
-            marks.append(arrived())
-    assert marks[-1] > 5_000_000
-    assert len(marks) > 150, "answers meanwhile"
 
 
 def test_a_stream_ends_though_a_switch_passed_the_last_steps_over(server, client, begin, step):
@@ -273,6 +236,53 @@ def test_a_stream_goes_on_though_its_session_leaves_the_store_while_it_is_looked
         assert moved == [True]
 
     asyncio.run(watch())
+
+
+def test_of_many_streams_that_are_behind_one_at_a_time_reads(server, begin, step):
+    session, pose = begin(), ahead(1)[0]
+    for t in range(3):
+        assert step(session, t, [pose]).status_code == 200
+    id, reading, most = scoped("", session["id"]), [], []
+
+    async def watch():
+        async with another_server(server) as (store, watchers):
+            ask = store.news
+
+            async def news(asked):
+                if asked[0][1] == 3:  # what is new
+                    return await ask(asked)
+                reading.append(asked)
+                most.append(len(reading))
+                await asyncio.sleep(0)
+                found = await ask(asked)
+                reading.remove(asked)
+                return found
+
+            store.news = news
+            streams = [await watchers.open(id, -1) for _ in range(9)]
+            assert await asyncio.gather(*(ids_told(stream, 2) for stream in streams)) == [[0, 1, 2]] * 9
+        assert most == [1] * 9
+
+    asyncio.run(watch())
+
+
+def test_of_many_who_read_a_trajectory_one_is_given_a_line_in_a_round_of_the_event_loop():
+    async def read():
+        turns, written, most = asyncio.Lock(), 0, 0
+
+        async def reader():
+            nonlocal written
+            async for _ in _each(iter([b"{}"] * 20), turns):
+                written += 1
+
+        readers = asyncio.gather(*(reader() for _ in range(50)))
+        while not readers.done():
+            before = written
+            await asyncio.sleep(0)
+            most = max(most, written - before)
+        assert (written, most) == (1000, 1)
+
+    asyncio.run(read())
 
 
 def test_a_step_is_told_once_though_it_is_decided_while_the_archive_is_read(server, begin, step):
