@@ -23,7 +23,7 @@ def check_drive(
         str | None, typer.Option(help="Topic of poses in the map's frame. By default the only one.")
     ] = None,
 ) -> None:
-    """Say whether a drive in a rosbag2 kept a policy's rule, and from which step on no way to was found.
+    """Say whether a drive in a rosbag2 kept the rule, and from which step on no way to keep it was found.
 
     The exit status is 1 if the rule is broken, or open while no way to keep it was found; else 0.
     """

@@ -44,7 +44,7 @@ from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
-AGAIN = 2.0  # [s] until a task of the server that has ended with an error is begun again
+AGAIN = 2.0  # [s] until a task that ended with an error is begun again. Chosen by hand.
 log = logging.getLogger("specshield")
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite

@@ -26,7 +26,7 @@ from specshield.service.settings import Settings
 ARRIVED = "arrived"  # in `scope["state"]` once the whole request is here, so that no wait needs a limit
 PIECE = 2048  # [bytes]; chosen by hand: a step fits, and the pings that fit take some 1 to 5 ms
 SHARE = 0.001  # [s] of a round of the event loop for all streams together, or one piece. Chosen by hand.
-FREE = 64 << 10  # [bytes] of each body, or of a message of a stream, that count for no limit on all together
+FREE = 64 << 10  # [bytes] of each body or message that the limit on all of them together does not count
 AT_ONCE = 1 << 16  # [bytes] of an answer that are sent at once: waiting for more would gain nothing
 KEPT_FILES = 256  # file descriptors for the store, files and child processes
 

@@ -31,7 +31,7 @@ from specshield.service.watch import logs
 
 LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
 LENGTH = struct.Struct("<Q")
-NOT_BEGUN = (0, 0)  # the first word where there is no fork, in the place of its process id and its memory
+NOT_BEGUN = (0, 0)  # what the template sends if it cannot fork, in place of a process id and its memory
 
 
 def template(control: socket.socket) -> None:

@@ -26,8 +26,8 @@ from specshield.world.learned import LearnedMap, applied
 from specshield.world.occupancy import OccupancyGrid
 
 log = logging.getLogger("specshield")
-ROOM = 256 << 20  # [bytes] of tables that are kept: a session's take about 1 MB, or up to 100 for a planner
-SESSIONS = 1000  # for which it is known what was made last
+ROOM = 256 << 20  # [bytes] of tables. A session's take about 1 MB, a planner's up to 100. Chosen by hand.
+SESSIONS = 1000  # of which it is remembered what tables were last begun for. Chosen by hand.
 
 
 class Made(NamedTuple):
@@ -54,7 +54,7 @@ class Tables:
     def __init__(self) -> None:
         self._threads = Background("tables")
         self._newest = files.Recent[Made](ROOM, attrgetter("size"))
-        # What they were last begun for, and when they are done.
+        # By session: the map and the policies that its tables were last begun for, and whether they are done.
         self._last = files.Recent[tuple[object, Future[None]]](SESSIONS)
 
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
