@@ -33,8 +33,8 @@ Headers = Mapping[bytes, bytes]  # names in lower case
 
 
 def headers_of(sent: Sequence[tuple[bytes, bytes]]) -> Headers:
-    """A request's headers by name. Raises InputError if one of `ONCE` came more than once: a proxy in front of
-    the server may have judged by another one than this server would (RFC 9112, section 3.2).
+    """A request's headers by name. Raises InputError if one of `ONCE` came more than once: a proxy before the
+    server may have judged by another one (RFC 9112, section 3.2).
     """
     headers = dict(sent)
     if len(headers) < len(sent):
@@ -42,7 +42,7 @@ def headers_of(sent: Sequence[tuple[bytes, bytes]]) -> Headers:
         for name in ONCE:
             if (count := names.count(name)) > 1:
                 told = name.decode().title()
-                raise InputError(f"the header {told} came {count} times", path=told, expected="this header once")
+                raise InputError(f"the header {told} came {count} times", path=told, expected="one of it")
     return headers
 
 
