@@ -391,10 +391,14 @@ def test_a_session_read_back_brings_the_continuation_received_last():
     answers = [json.loads(decided(t, M, witness=[B, M], next_poses=leads[t]).content) for t in range(2)]
     items = [{"t": t, "pose": [0.2 * t, 0, 0], "signals": {}, "decision": answers[t]} for t in range(2)]
     state = robust(initial_pose=None, next_t=2)
-    drive(state._recall(), answer({"items": items, "next": None}))
+    _, (request,), _ = drive(state._recall(), answer({"items": items, "next": None}))
+    assert request.params == {"after": "-1"}
     decision, _ = step(state, 0.4, *AWAY)
     assert (decision.source, decision.execute, decision.t) == ("witness", B, 2)
     items.append({"t": 2, "pose": [0.4, 0, 0], "signals": {}, "decision": None})
     state = robust(initial_pose=None, next_t=3)
     drive(state._recall(), answer({"items": items, "next": None}))
     assert step(state, 0.4, *AWAY)[0].source == "stop", "a step without a decision came after it"
+    state = robust(initial_pose=None, next_t=9_000)
+    _, (request,), _ = drive(state._recall(), answer({"items": items, "next": None}))
+    assert request.params == {"after": "8899"}, "a long session is not read back as a whole"

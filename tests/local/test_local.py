@@ -91,6 +91,8 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
             json.loads(json.dumps([each.t, each.pose, each.signals, each.decision]))
             for each in remote.trajectory()
         ]
+        assert local.trajectory(after=78) == local.trajectory()[79:]
+        assert [each.t for each in remote.trajectory(after=78)] == [each.t for each in local.trajectory(78)]
 
 
 def test_a_server_switches_the_same(server: RunningServer) -> None:

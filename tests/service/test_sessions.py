@@ -260,7 +260,12 @@ def test_close_gives_the_verdict_and_keeps_the_trajectory(client, begin, step):
     problem(client.post(path, json={"t": 9, "poses": ahead(9)[-1:]}), 409, "session-finished")
     problem(step(session, 9, ahead(9)[-1:]), 409, "session-finished")
     assert step(session, 0, [START]).status_code == 200  # a replay
-    assert len(client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]) == 9
+    path = f"/v1/sessions/{session['id']}/trajectory"
+    items = client.get(path).json()["items"]
+    assert len(items) == 9
+    assert client.get(path, params={"after": 5}).json()["items"] == items[6:]
+    assert client.get(path, params={"after": 8}).json()["items"] == []
+    assert problem(client.get(path, params={"after": -2}), 422, "invalid-input")["path"] == "after"
 
 
 def test_a_finished_session_can_be_closed_once_policy_and_map_are_deleted(client, begin, step, monkeypatch):

@@ -80,6 +80,11 @@ class Branch(NamedTuple):
     plan: tuple[int, ...]
 
 
+# A new process reads back the answers of so many steps: enough to see how far each motion leads where nothing
+# is in its way. Chosen by hand.
+RECALLED = 100
+
+
 @dataclass
 class Continuation:
     """The latest certified continuation, followed from pose to pose without a map.

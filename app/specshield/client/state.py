@@ -10,7 +10,7 @@ from operator import itemgetter
 from typing import Any, Literal
 
 from specshield.client import wire
-from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away, is_taken
+from specshield.client.away import RECALLED, Branch, Circuit, Continuation, OnFailure, is_away, is_taken
 from specshield.client.calls import policies_asked
 from specshield.client.core import Flow, T, Within, call, deliver, fetch
 from specshield.client.events import Events
@@ -220,7 +220,7 @@ class SessionState:
         """Reads the certified continuation from the stored answers, after the robot's process began anew."""
         if self.on_failure != "witness" or self.finished:
             return
-        for item in (yield from self._trajectory()) if self.t else ():
+        for item in (yield from self._trajectory(self.t - 1 - RECALLED)) if self.t else ():
             self._continuation.branches = ()
             if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
                 decision = decision_of(item.decision, vars(self.info), self.info.main_task_done, {})
@@ -289,9 +289,10 @@ class SessionState:
 
         return Events(self.id, self.t - 1 if after is None else after, decided, switched)
 
-    def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
-        """The states x_0 .. x_t that the server has, with its answers."""
-        body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True))
+    def _trajectory(self, after: int = -1) -> Flow[tuple[TrajectoryItem, ...]]:
+        """The states that the server has after step `after`, with its answers."""
+        asked = {"after": str(max(after, -1))}
+        body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True, params=asked))
         return tuple(build(TrajectoryItem, item) for item in build(Page, body).items)
 
     def _learned(self) -> Flow[Learned]:

@@ -230,12 +230,13 @@ class LocalSession:
         low, high = map(handover.finite, bounds)
         return Verdict(self.spec_status, (low, high))
 
-    def trajectory(self) -> tuple[TrajectoryItem, ...]:
-        """The states x_0 .. x_t, with the answers (the contract's names)."""
+    def trajectory(self, after: int = -1) -> tuple[TrajectoryItem, ...]:
+        """The states after step `after`, with the answers (the contract's names)."""
         held = self._held({}, len(self._known))
         return tuple(
             TrajectoryItem(t, pose, {name: held[name][t] for name in reads}, self._told(t), rule)
             for t, pose in enumerate(self._known)
+            if t > after
             for rule in [max(i for i, each in enumerate(self._rules) if each.begins <= t)]
             for reads in [sorted(self._rules[rule].shield.task.signals)]
         )

@@ -186,9 +186,10 @@ async def trajectory(
         Literal["json", "ndjson"] | None,
         Query(description="`Accept: application/x-ndjson` asks for NDJSON too."),
     ] = None,
+    after: Annotated[int, Query(ge=-1, le=1_000_000, description="Leave out the steps up to this one.")] = -1,
 ) -> Response:
     """The states x_0 to x_t with the answers, as one JSON object or as one JSON object in each line."""
-    lines, rules = await server.sessions.trajectory(key)
+    lines, rules = await server.sessions.trajectory(key, after)
     if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
         return StreamingResponse(_each(lines, server.reading), media_type=NDJSON)
     return StreamingResponse(_listed(lines, rules, server.reading), media_type="application/json")
@@ -221,7 +222,8 @@ async def _each(lines: Iterator[bytes], turns: asyncio.Lock) -> AsyncIterator[by
 
 
 async def _listed(lines: Iterator[bytes], rules: bytes, turns: asyncio.Lock) -> AsyncIterator[bytes]:
-    before = b'{"items":['
+    yield b'{"items":['
+    before = b""
     async for line in _each(lines, turns):
         yield before + line
         before = b","

@@ -149,9 +149,12 @@ class Session(NamedTuple):
         occupied, free = (known.cell[known.occupied == held].tolist() for held in (True, False))
         return files.to_json({**about, "occupied": occupied, "free": free})
 
-    def lines(self, steps: Sequence[bytes]) -> Iterator[bytes]:
-        """One JSON object for each step: t, pose, signals, index of the rule, the logits sent, the answer."""
-        for t, row in enumerate(self.rows):
+    def lines(self, steps: Sequence[bytes], after: int) -> Iterator[bytes]:
+        """One JSON object for each step after step `after`: t, pose, signals, index of the rule, the logits
+        sent, the answer.
+        """
+        for t in range(after + 1, len(self.rows)):
+            row = self.rows[t]
             held, index = row.tolist(), ruled.at(self.rules, t)
             rule, values = self.rules[index], dict(zip(self.signal_names, held[3:], strict=True))
             signals = {name: values[name] for name in sorted(rule.spec["signals"])}

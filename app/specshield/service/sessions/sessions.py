@@ -189,11 +189,12 @@ class Sessions:
                 raise
             return session, session.state.spec_status, (-math.inf, math.inf)
 
-    async def trajectory(self, id: str) -> tuple[Iterator[bytes], bytes]:
-        """One JSON object for each step (`Session.lines`), and the rules as one JSON list."""
+    async def trajectory(self, id: str, after: int) -> tuple[Iterator[bytes], bytes]:
+        """One JSON object for each later step (`Session.lines`), and the rules as one JSON list."""
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
-        return session.lines(found.steps), files.to_json(describe(session.rules, session.state)["rules"])
+        rules = files.to_json(describe(session.rules, session.state)["rules"])
+        return session.lines(found.steps, after), rules
 
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""
