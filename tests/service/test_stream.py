@@ -9,7 +9,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from itertools import pairwise
-from statistics import median
 
 import httpx
 import msgpack
@@ -269,8 +268,9 @@ def test_a_flood_of_small_frames_holds_up_nobody(server, client, begin, frame):
         for _ in range(30):
             assert client.get("/livez").status_code == 200
             marks.append(sent)
-        # By the tenth, what lies between the two is full. The median, since on a busy machine some wait long.
-        taken = median(after - before for before, after in pairwise(marks[9:]))
+        # By the tenth, what lies between the two is full. While another process has the client's processor,
+        # the server goes on with the flood: so it is the quickest quarter of the requests that counts.
+        taken = sorted(after - before for before, after in pairwise(marks[9:]))[5]
         over.set()
         flood.shutdown(socket.SHUT_RDWR)
         sending.join()
