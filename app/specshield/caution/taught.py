@@ -35,7 +35,16 @@ from specshield.caution.surprise.contact import (
 )
 from specshield.caution.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.compiled import leaf
-from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
+from specshield.robot.dynamics import (
+    Body,
+    displacement,
+    displacements,
+    longest_motions,
+    make_body,
+    overlap,
+    successors,
+    wrap,
+)
 from specshield.shield.decision import Carry, Shield, Stuck
 from specshield.shield.feasibility import Prefix
 from specshield.shield.proposal import adapted
@@ -186,7 +195,7 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and unsure:
         room = not shield.task.robot.goes_back
-        far, turn = (max(map(abs, each.tolist())) or math.inf for each in displacements(shield.body))
+        far, turn = (longest or math.inf for longest in longest_motions(shield.body))
         around = max(AROUND, math.ceil(AROUND_FAR / far + AROUND_TURNED / turn - 1e-9))
         least = max(least, around + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if room else 0))
     return Care(care.margin, least, *care[2:5], barred, on_way and unsure, room)

@@ -118,9 +118,9 @@ def as_actions(shield: Shield, witnesses: Witnesses, action: int) -> tuple[int, 
 
 def j_values_of(shield: Shield, certified: Certified) -> tuple[float | None, ...]:
     """J of each action [A]; a terminal one has the highest of the others (docs/architecture.md)."""
-    binary, terminal = shield.config.evaluation == "feasibility", shield.task.robot.terminal.tolist()
-    values = [float(value) for value in (certified.feasible if binary else certified.values).tolist()]
-    return as_numbers([max(values) if ends else value for ends, value in zip(terminal, values, strict=True)])
+    binary = shield.config.evaluation == "feasibility"
+    values = certified.feasible.astype(np.float64) if binary else certified.values
+    return as_numbers(np.where(shield.task.robot.terminal, values.max(), values).tolist())
 
 
 def as_numbers(values: list[float]) -> tuple[float | None, ...]:
