@@ -54,6 +54,10 @@ specification be satisfied over the whole remaining horizon. The model is never 
 Metres, radians, counter-clockwise, map frame (REP-103). Errors are problem documents (RFC 9457): `type` is a
 stable word, and for bad input `path`, `got` and `expected` say what was wrong. The examples work in this
 order: check a formula, send a map, begin a session, decide a step, close, read the trajectory, erase.
+
+x_t is the pose at step t, T the rule's last step (its horizon), and f the model of the robot's motions. J of
+an action is 1 if a future that begins with it keeps the rule, and S_t has the actions with J = 1. pi_FM is
+the model's distribution, pi* the answer's, and rho the robustness [m], by which a trajectory keeps the rule.
 """
 
 

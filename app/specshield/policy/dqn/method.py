@@ -32,7 +32,9 @@ class Settings:
         (0.5, 0.008), "Chance of a random motion, of the boldest and of the most careful robot.", high=1.0
     )
     gap: float = option(
-        0.6, "Share of an action's loss against the best one that is taken off its target.", high=1.0
+        0.6,
+        "The target of an action is lowered by this share of what its value lacks to that of the best one.",
+        high=1.0,
     )
     evaluate_every: int = option(
         1000, "Updates between two measurements; each also saves a checkpoint.", low=1, high=1_000_000

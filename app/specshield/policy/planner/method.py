@@ -15,8 +15,8 @@ class Settings:
     pitch: float = option(0.1, "Side of a cell of the lattice [m].", low=0.02, high=1.0)
     effort: float = option(
         10_000.0,
-        "What one plan may cost [about us]; a decision costs 2 to 3 times that. Over 150 steps of horizon it "
-        "grows with the horizon's square: a way has more legs, and each costs more.",
+        "How long one plan may take, in microseconds, roughly; a decision takes 2 to 3 times as long. With a "
+        "horizon above 150 steps, a plan takes longer, by the square of the horizon.",
         low=100.0,
         high=1e7,
     )

@@ -72,7 +72,7 @@ EVENT = {  # the schema of one event
             "event is `event: end`. Comments keep the connection alive.",
         },
         204: {"description": "The session is over and has no further event: do not ask again."},
-        **problems(**GONE, _429="The server has no room for more streams."),
+        **problems(**GONE, _429="`limit-reached`: the server has no room for more streams."),
     },
 )
 async def events(
@@ -145,7 +145,7 @@ Places = Annotated[
             "description": "Server-sent events: `data` has `session`, `t`, `pose`, `logits`, `decision`, as "
             "in a trajectory; in the last event of a session, `session`, `finished` and `spec_status`.",
         },
-        **problems(_429="The server has no room for more streams."),
+        **problems(_429="`limit-reached`: the server has no room for more streams."),
     },
 )
 async def several(server: ServerState, owner: Owner, session: Places) -> Response:

@@ -53,7 +53,7 @@ def _described() -> dict[str, Any]:
     summary="Send a map",
     responses=problems(
         _409="`name-taken`: something else of yours has the name.",
-        _429="The server keeps no more maps.",
+        _429="`limit-reached`: the server keeps no more maps; delete one.",
         **FULL,
         **TOO_MUCH,
     ),

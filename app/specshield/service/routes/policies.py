@@ -46,7 +46,7 @@ PolicyId = Annotated[
     responses=problems(
         _404="No such map.",
         _409="`name-taken`: something else of yours has the name.",
-        _429="The server keeps no more policies.",
+        _429="`limit-reached`: the server keeps no more policies; delete one.",
         _503=f"`training-unavailable`: no worker is there to train; the store is away; or {TOO_MUCH['_503']}",
         **FULL,
     ),

@@ -48,7 +48,7 @@ GONE = {"_404": "No such session; it may have expired.", "_503": "The store is a
     responses=problems(
         _404="No such policy.",
         _409="`session-exists`: you have a session of this id.",
-        _429="The server keeps no more sessions.",
+        _429="`limit-reached`: the server keeps no more sessions.",
         _503="The store is away: try again.",
         _507="`insufficient-storage`: the disk is full.",
     ),
@@ -115,7 +115,7 @@ async def delete(key: SessionKey, server: ServerState) -> Response:
 async def step(key: SessionKey, body: StepRequest) -> Response:
     """Send where the robot is and what its model proposes; get the closest distribution that keeps the rule.
 
-    `poses` ends with x_t. It may begin anywhere up to the first pose that the server does not have. A decided
+    `poses` ends with x_t, and begins with a pose that the server has, or the first that it lacks. A decided
     step that is sent again with equal x_t, logits, signals and main_task_done gets the stored answer byte for
     byte, so a lost answer can be asked for again. After an error nothing is stored.
 
@@ -133,7 +133,7 @@ async def step(key: SessionKey, body: StepRequest) -> Response:
     responses=problems(
         _404="No such session or policy.",
         _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
-        _429="The session has had too many rules.",
+        _429="`limit-reached`: the session has had too many rules.",
         _503="The store is away: try again.",
     ),
 )

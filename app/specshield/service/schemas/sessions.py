@@ -85,9 +85,9 @@ class SessionRequest(_Policies):
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility",
         description="What J is: whether the rule can be kept, 1 or 0 (`feasibility`), or the robustness "
-        "itself (`robustness`). Then only the mean of J reaches `threshold`, so actions that break "
-        "the rule may keep some probability. If no action reaches the threshold, as often with 1 m, the "
-        "answer is a `fallback`: choose a threshold that fits the rule.",
+        "itself (`robustness`). With `robustness` only the mean of J reaches `threshold`, so actions that "
+        "break the rule may keep some probability. If no action reaches the threshold, as often with 1 m, "
+        "the answer is a `fallback`: choose a threshold that fits the rule.",
     )
     shaping: Name = Field(PROJECTION, json_schema_extra=_describe_shaping)
     max_steps: int | None = Field(
@@ -99,7 +99,7 @@ class SessionRequest(_Policies):
         description="`learned`: margin and slack of every decision follow from how the robot has moved so "
         "far. At first they are large; they shrink while the robot moves as foreseen. A given `margin` or "
         "`slack` is the least that is kept. An object says what is known before the first step. `none`: the "
-        "robot is taken to move exactly as described, as in the paper.",
+        "robot is taken to move exactly as described. The paper's settings have `learn_map` false too.",
     )
     learn_map: bool = Field(
         True, description="Whether a motion that stops short marks what it ran into on the session's map."

@@ -24,7 +24,8 @@ class StepRequest(Strict):
         description="The step to decide. A step is decided once: sent again, it returns the stored answer.",
     )
     poses: Poses = Field(
-        description="Poses that end with x_t and begin anywhere up to the first one that the server lacks."
+        description="The poses up to x_t, where the robot is now. The first one may be any pose that the "
+        "server has already, or the first that it does not have."
     )
     logits: list[float | None] | None = Field(
         None,
@@ -109,14 +110,20 @@ class StepResponse(BaseModel):
     action: int = Field(description="The action drawn from `distribution` by the session's seed and t.")
     action_name: str = Field(description="The name of `action`.")
     completion_action: int | None = Field(
-        description="The next action of the certified continuation; null once the specification is settled."
+        description="The action to run if `action` ends the task: the next one of the certified "
+        "continuation, or in mode `fallback` what the policy would do. Null in mode `prior`."
     )
     spec_status: SpecStatus = Field(description="The verdict on x_0 .. x_t, whatever may follow.")
-    feasible_mass: float | None = Field(description="pi_FM(S_t), of the non-terminal actions.")
-    kl: float | None = Field(
-        description="KL(pi* || pi_FM) [nats]; null if pi* leaves the support of the prior."
+    feasible_mass: float | None = Field(
+        description="pi_FM(S_t): the probability that the model itself gives to S_t, if it does not end."
     )
-    reason: str | None = Field(description="Why the mode is a fallback, or what else there is to know.")
+    kl: float | None = Field(
+        description="KL(pi* || pi_FM) [nats]; null if the model excludes an action that pi* does not."
+    )
+    reason: str | None = Field(
+        description="Why the mode is `fallback` (`infeasible`, `zero_prior_mass`); or `margin_unattainable`: "
+        "the margin or the slack that was asked for could not be had."
+    )
     finished: bool = Field(description="Whether no further step will be decided.")
     in_collision: bool = Field(description="Whether x_t touches an obstacle.")
     next_poses: list[Pose] = Field(description="f(x_t, a) for each action.")
@@ -126,9 +133,12 @@ class StepResponse(BaseModel):
     warnings: list[str] = Field(
         description="What did not go as it should, such as a policy whose proposal could not be used."
     )
-    witness: list[int] | None = Field(description="The action indices that follow `action` to the horizon.")
+    witness: list[int] | None = Field(
+        description="The certified continuation: the actions that follow the one to run, up to the rule's "
+        "last step. Null: none is certified."
+    )
     witnesses: list[list[int] | None] | None = Field(
-        None, description="The witness of each action, if asked for."
+        None, description="The certified continuation after each action, if asked for."
     )
     margin: float = Field(description="The robustness above 0 that J asked for at this step [m].")
     slack: int = Field(description="The reserve before deadlines that J asked for at this step [steps].")
