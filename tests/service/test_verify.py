@@ -143,6 +143,15 @@ def test_what_is_no_record_is_refused(content):
         chain.read(content)
 
 
+def test_a_record_whose_id_leads_to_another_folder_is_refused(case1):
+    """By default a command names the file that it writes by the session's id."""
+    file = msgspec.msgpack.decode(case1[0])
+    for id in ("../../etc/cron", "a/b", "a\0b", "", ".."):
+        config = json.dumps({**json.loads(file["config"]), "id": id}).encode()
+        with pytest.raises(InputError, match="the session's id is none that a server would take"):
+            chain.read(chain.pack(config, file["rows"], [])[0])
+
+
 def forged(content: bytes, t: int, **changed: Any) -> bytes:
     """A whole chain of which one step says something else: who holds the server can make one."""
     file, steps = msgspec.msgpack.decode(content), list(chain.read(content).steps)
