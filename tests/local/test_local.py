@@ -33,6 +33,7 @@ from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Circle
 from tests.service.world import grid_json, policy_files, send_policy
 from tests.serving import RunningServer
 
@@ -495,6 +496,26 @@ def test_a_file_of_areas_that_cannot_be_used_is_named(tmp_path: Path, areas: str
     with pytest.raises(MapError, match=said):
         LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False)
     assert Maps(Settings(maps_dir=tmp_path, data_dir=tmp_path / "data")).shipped("floor") is None
+
+
+def test_rooms_are_given_like_regions_and_a_wrong_one_is_named() -> None:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    place = {"type": "circle", "center": np.array([2.0, 2.0]), "radius": 0.5}
+    made = LocalShield.make(grid, "F[0,40] Attic", rooms={"Attic": place}, robot=ROBOT, check=False)
+    assert made.task.regions == {"Attic": Circle((2.0, 2.0), 0.5)}
+    for given, path in (({"rooms": {"Attic": 1}}, "rooms.Attic"), ({"regions": {1: place}}, "regions.1")):
+        with pytest.raises(MapError) as caught:
+            LocalShield.make(grid, "F[0,40] Attic", **given)
+        assert caught.value.path == path
+
+
+def test_a_card_without_an_id_is_refused_where_it_is_read(tmp_path: Path) -> None:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, check=False).save(tmp_path)
+    card = json.loads((tmp_path / "card.json").read_text())
+    (tmp_path / "card.json").write_text(json.dumps({n: v for n, v in card.items() if n != "id"}))
+    with pytest.raises(PolicyError, match="which has an id"):
+        LocalShield.load(tmp_path)
 
 
 @pytest.mark.parametrize("rule", ["F[0,10] 0 > 1", "G[0,10] 0 >= 0"])
