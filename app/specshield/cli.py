@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import json
 import os
@@ -80,9 +81,11 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
         StatusLine().clear()  # a command may have left a line there
         sys.exit(str(error))
     except OSError as error:
-        if error.filename is None:  # with a name, it is most likely a file or folder that the caller named
-            raise
-        sys.exit(f"{error.filename} cannot be used: {error.strerror}")
+        if error.filename is not None:  # most likely a file or folder that the caller named
+            sys.exit(f"{error.filename} cannot be used: {error.strerror}")
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):  # where a write fails, Python names no file
+            sys.exit(f"what this command writes is not complete: {error.strerror}")
+        raise
     except ModuleNotFoundError as error:
         from specshield.commands.doctor import missing_parts
 
@@ -202,7 +205,8 @@ def verify(
     """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
 
     The exit status is 0 if nothing differs, 1 if something does, 2 if only the chain could be checked, as map
-    or policy are missing, 3 if the file cannot be read, 4 if a step differs that another version decided.
+    or policy are missing, 3 if the file cannot be read or the result not be printed, 4 if a step differs
+    that another version decided.
     """
     from specshield.service import verify as verifying
     from specshield.service.settings import read_settings
@@ -216,9 +220,13 @@ def verify(
                 raise InputError("there is no such folder", path=option, got=str(folder), expected="a folder")
         settings = read_settings().model_copy(update=named)
         status = verifying.verify(file, settings)
+        sys.stdout.flush()
     except SpecshieldError as error:
         print(error, file=sys.stderr)
         status = 3
+    except OSError as error:  # of standard output: its status would else be 1, as of a record that differs
+        print(f"the result cannot be printed: {error.strerror}", file=sys.stderr)
+        os._exit(3)  # a further try to print the rest, at the end of the interpreter, would change the status
     raise typer.Exit(status)
 
 

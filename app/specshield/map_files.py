@@ -8,6 +8,7 @@ from pathlib import Path
 
 from specshield.errors import MapError
 from specshield.task import parse_regions
+from specshield.world import checks
 from specshield.world.map_server import parse, read_yaml, text_of
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region
@@ -17,7 +18,7 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     """The map of a `.yaml`, and the areas in `<name>.regions.json` beside it, if there is such a file.
 
     The image, beside it too, is the PGM or PNG that the YAML names, else `<name>.pgm` or `<name>.png`. Raises
-    MapError, and ValueError if the areas are no JSON.
+    MapError.
     """
     metadata = None
     with suppress(OSError):
@@ -36,5 +37,13 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
         raise MapError(told, path="image", got=str(path), expected=expected)
     grid, _ = parse(metadata, found[0].read_bytes())
     named = path.with_suffix(".regions.json")
-    areas = json.loads(named.read_bytes()) if named.is_file() else {}
-    return grid, parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
+    try:
+        areas = json.loads(named.read_bytes()) if named.is_file() else {}
+    except (ValueError, RecursionError) as error:
+        told, expected = f"{named} cannot be read: {error}", "a JSON object with `rooms`, `regions` or both"
+        raise MapError(told, path=named.name, expected=expected) from None
+    checks.mapping(areas, named.name)
+    rooms, regions = (
+        checks.mapping(areas.get(kind, {}), f"{named.name}.{kind}") for kind in ("rooms", "regions")
+    )
+    return grid, parse_regions({**rooms, **regions}, named.name)

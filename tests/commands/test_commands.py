@@ -270,6 +270,8 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
         other.shutdown()
     assert re.search(r"^wrong +what answers at \S+ is no specshield server", lost.stdout, re.M), lost.stderr
     assert re.search(r"^ok +the server at \S+ is ready", undated.stdout, re.M), undated.stderr
+    nowhere = run_specshield("doctor", "--url", "nowhere", SPECSHIELD_DATA_DIR=str(tmp_path)).stdout
+    assert re.search(r"^wrong +--url: this is not the address of a server; got 'nowhere'", nowhere, re.M)
     assert ill.returncode == 1
     assert f"port {port} cannot be served on: Address already in use\n" in ill.stdout
     parted = run_specshield(

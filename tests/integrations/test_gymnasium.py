@@ -93,6 +93,11 @@ def test_a_maze_in_which_the_rule_cannot_be_kept_is_refused() -> None:
         minigrid_rooms.maze(minigrid_rooms.chance).reset(seed=378)
 
 
+def test_an_environment_that_is_not_of_minigrid_is_refused_at_once() -> None:
+    with pytest.raises(InputError, match=r"env: this is no MiniGrid environment; got .*CartPole"):
+        minigrid.shielded(gymnasium.make("CartPole-v1"), "F[0,9] Room_0_0")
+
+
 class House(gymnasium.Env[Any, Any]):
     """A case's apartment; its task is done when the robot says so."""
 

@@ -29,8 +29,11 @@ from specshield.local import LocalShield
 from specshield.local.shield import read_map_files
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body, step
+from specshield.service.library.maps import Maps
+from specshield.service.settings import Settings
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Circle
 from tests.service.world import grid_json, policy_files, send_policy
 from tests.serving import RunningServer
 
@@ -474,6 +477,47 @@ def test_what_is_no_world_is_told_by_its_type() -> None:
     cells: Any = np.zeros((20, 20), bool)
     with pytest.raises(MapError, match="this is no world; got 'a ndarray'; expected an OccupancyGrid"):
         LocalShield.make(cells, "F[0,9] x > 1")
+
+
+@pytest.mark.parametrize(
+    ("areas", "said"),
+    [
+        ("{", "floor.regions.json cannot be read: Expecting property name"),
+        ("\x80", "floor.regions.json cannot be read"),
+        ("[]", "floor.regions.json is not a usable object"),
+        ('{"rooms": null}', "floor.regions.json.rooms is not a usable object"),
+        ('{"regions": {"Dock": 1}}', "floor.regions.json.Dock is not a usable object"),
+    ],
+)
+def test_a_file_of_areas_that_cannot_be_used_is_named(tmp_path: Path, areas: str, said: str) -> None:
+    """A server leaves such a map out, and says why in its log. It did not start."""
+    metadata, image = dump_map(OccupancyGrid(np.zeros((30, 30), bool), 0.25), "floor.pgm")
+    (tmp_path / "floor.yaml").write_text(metadata)
+    (tmp_path / "floor.pgm").write_bytes(image)
+    (tmp_path / "floor.regions.json").write_bytes(areas.encode("latin-1"))
+    with pytest.raises(MapError, match=said):
+        LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False)
+    assert Maps(Settings(maps_dir=tmp_path, data_dir=tmp_path / "data")).shipped("floor") is None
+
+
+def test_rooms_are_given_like_regions_and_a_wrong_one_is_named() -> None:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    place = {"type": "circle", "center": np.array([2.0, 2.0]), "radius": 0.5}
+    made = LocalShield.make(grid, "F[0,40] Attic", rooms={"Attic": place}, robot=ROBOT, check=False)
+    assert made.task.regions == {"Attic": Circle((2.0, 2.0), 0.5)}
+    for given, path in (({"rooms": {"Attic": 1}}, "rooms.Attic"), ({"regions": {1: place}}, "regions.1")):
+        with pytest.raises(MapError) as caught:
+            LocalShield.make(grid, "F[0,40] Attic", **given)
+        assert caught.value.path == path
+
+
+def test_a_card_without_an_id_is_refused_where_it_is_read(tmp_path: Path) -> None:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, check=False).save(tmp_path)
+    card = json.loads((tmp_path / "card.json").read_text())
+    (tmp_path / "card.json").write_text(json.dumps({n: v for n, v in card.items() if n != "id"}))
+    with pytest.raises(PolicyError, match="which has an id"):
+        LocalShield.load(tmp_path)
 
 
 @pytest.mark.parametrize("rule", ["F[0,10] 0 > 1", "G[0,10] 0 >= 0"])

@@ -7,11 +7,13 @@ import json
 import math
 import struct
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from specshield.commands.export import WRITERS
 from specshield.errors import InputError
 from specshield.local import LocalShield
 from specshield.recordings import drive
@@ -126,6 +128,15 @@ def test_rerun_writes_a_file(recording: Recording, tmp_path: Path) -> None:
     write_rrd(recording, tmp_path / "s.rrd")
     assert (tmp_path / "s.rrd").read_bytes()[:3] == b"RRF"
     assert (tmp_path / "s.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("to", list(WRITERS))
+def test_a_disk_that_is_full_is_told(recording: Recording, to: str) -> None:
+    """The library of Rerun said nothing of it, or waited for ever; that of Foxglove raised another error."""
+    pytest.importorskip({"mcap": "foxglove", "rrd": "rerun"}.get(to, "pyarrow"))
+    write = getattr(import_module(f"specshield.recordings.{WRITERS[to]}"), f"write_{to}")
+    with pytest.raises(OSError, match="No space left on device"):
+        write(recording, Path("/dev/full"))
 
 
 def bag_of(

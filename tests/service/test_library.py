@@ -87,7 +87,8 @@ def test_a_map_goes_once_no_policy_is_for_it(client):
     map_id = client.post("/v1/maps", json=grid(1)).json()["id"]
     assert client.delete(f"/v1/maps/{map_id}").status_code == 204
     problem(client.get(f"/v1/maps/{map_id}"), 404, "not-found", "map_id")
-    problem(client.delete(f"/v1/maps/{map_id}"), 404, "not-found", "map_id")
+    gone = problem(client.delete(f"/v1/maps/{map_id}"), 404, "not-found", "map_id")
+    assert gone["expected"] == "an id or name from /v1/maps"
     assert map_id not in client.get("/v1/maps", params={"limit": 1000}).text
     problem(client.delete("/v1/maps/case1"), 409, "in-use", "map_id")
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import time
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -19,7 +21,7 @@ from specshield.service.sessions import chain, record
 from specshield.service.settings import Settings
 from specshield.service.verify import verify
 from tests.service.world import ahead
-from tests.serving import run_specshield
+from tests.serving import HUNG, Forked, run_specshield
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +143,28 @@ def test_what_is_no_record_is_refused(content):
         InputError, match=r"no record of a session.*; expected what GET /v1/sessions/\{id\}/rec"
     ):
         chain.read(content)
+
+
+def test_a_result_that_cannot_be_printed_is_not_that_of_a_record_that_differs(case1, tmp_path):
+    """It was status 1. Other commands end with one line, too."""
+    file, told = tmp_path / "a.record", tmp_path / "stderr"
+    file.write_bytes(case1[0])
+    for asked, status, said in (
+        (["verify", str(file)], 3, "the result cannot be printed"),
+        (["openapi"], 1, "what this command writes is not complete"),
+    ):
+        command = Forked(asked, {**os.environ}, stdout=Path("/dev/full"), stderr=told, cwd=tmp_path)
+        assert command.wait(HUNG) == status
+        assert told.read_text().splitlines()[-1] == f"{said}: No space left on device"
+
+
+def test_a_record_whose_id_leads_to_another_folder_is_refused(case1):
+    """By default a command names the file that it writes by the session's id."""
+    file = msgspec.msgpack.decode(case1[0])
+    for id in ("../../etc/cron", "a/b", "a\0b", "", ".."):
+        config = json.dumps({**json.loads(file["config"]), "id": id}).encode()
+        with pytest.raises(InputError, match="the session's id is none that a server would take"):
+            chain.read(chain.pack(config, file["rows"], [])[0])
 
 
 def forged(content: bytes, t: int, **changed: Any) -> bytes:

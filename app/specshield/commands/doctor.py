@@ -197,7 +197,11 @@ def _server(url: str) -> Iterator[Finding]:
     from specshield.client.network.bounded import is_direct
     from specshield.client.network.transport import address
 
-    server, began = address(url), time.time()
+    try:
+        server, began = address(url), time.time()
+    except SpecshieldError as error:
+        error.path = "--url"
+        raise
     at, proxies = str(server).rstrip("/"), not is_direct(server.host)
     elsewhere = "specshield serve, or another --url"
     try:

@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 from minigrid.core.actions import Actions
 from minigrid.core.roomgrid import RoomGrid
+from minigrid.minigrid_env import MiniGridEnv
 
 from specshield.arrays import Bools
 from specshield.client.models import Pose
+from specshield.errors import InputError
 from specshield.integrations.gymnasium import Environment, ShieldWrapper
 from specshield.local import LocalShield
 from specshield.robot import Action, Robot
@@ -43,8 +45,12 @@ def shielded(
 ) -> ShieldWrapper:
     """`env`, a MiniGrid environment, inside a rule over its rooms and `regions`. options: of ShieldWrapper.
 
-    Each `reset` makes a policy for its map, in some hundredths of a second.
+    Each `reset` makes a policy for its map, in some hundredths of a second. Raises InputError for another
+    environment.
     """
+    if not isinstance(env.unwrapped, MiniGridEnv):
+        told, expected = "this is no MiniGrid environment", "one of MiniGrid or BabyAI; or ShieldWrapper"
+        raise InputError(told, path="env", got=str(env), expected=expected)
 
     def made(env: Environment) -> LocalShield:  # check=False: random starts lie off the cells' centres
         world, rooms, pitch = grid_of(env), rooms_of(env), {"pitch": 1.0}

@@ -81,9 +81,11 @@ def _read(given: Mapping[str, Any], kinds: Mapping[str, Kind], at: str = "") -> 
 
 
 def plain(value: Any) -> Any:
-    """The value with lists and numbers of Python in place of those of numpy, also in its members."""
+    """The value with lists and numbers of Python in place of those of numpy, also in its members, whose names
+    are texts.
+    """
     if isinstance(value, Mapping):
-        return {name: plain(each) for name, each in value.items()}
+        return {str(name): plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
     return value.tolist() if hasattr(value, "tolist") else value

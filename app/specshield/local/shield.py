@@ -29,7 +29,7 @@ from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
 from specshield.shipped import MAPS, MODELS
-from specshield.task import Task, make_task
+from specshield.task import Task, make_task, parse_regions
 from specshield.world.formats import read_map
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
@@ -61,11 +61,11 @@ class LocalShield:
     @staticmethod
     def shipped(name: str) -> LocalShield:
         """The policy of this name that came with specshield, such as `case1`. Raises NotFound."""
-        folder = MODELS / name
         names = sorted(card.parent.name for card in MODELS.glob("*/card.json"))
         if name not in names:
             expected = f"one of {', '.join(names)}"
             raise NotFound("no such policy came with specshield", path="name", got=name, expected=expected)
+        folder = MODELS / name
         wanted = json.loads((folder / "card.json").read_text())["map_id"]
         for path in sorted(MAPS.glob("*.yaml")):
             if wanted in (path.stem, _read_world(path)[0].content_hash):
@@ -80,10 +80,10 @@ class LocalShield:
         folder = Path(folder)
         try:
             card = json.loads((folder / "card.json").read_text())
-            robot, spec, formula = card["robot"], card["spec"], card["spec"]["formula"]
+            robot, spec, formula, _ = card["robot"], card["spec"], card["spec"]["formula"], card["id"]
             weights = (folder / "policy.safetensors").read_bytes()
         except (OSError, ValueError, KeyError, TypeError) as error:
-            expected = "a folder with card.json, which has a robot and a spec, and policy.safetensors"
+            expected = "a folder with card.json, which has an id, a robot and a spec, and policy.safetensors"
             wrong = f"no policy can be read there: {error}"
             raise PolicyError(wrong, path="folder", got=str(folder), expected=expected) from None
         if world is None:
@@ -104,7 +104,7 @@ class LocalShield:
         formula: str,
         regions: Mapping[str, Any] | None = None,
         *,
-        rooms: Mapping[str, Region] | None = None,
+        rooms: Mapping[str, Any] | None = None,
         signals: Mapping[str, float] | None = None,
         robot: Robot | str | Mapping[str, Any] = "stretch",
         method: str = DEFAULT,
@@ -115,13 +115,15 @@ class LocalShield:
         """Make a policy, by reachability in about a second.
 
         world: a grid, the path of a map's `.yaml`, or a map as the API takes it in JSON, with its `format`.
-        rooms: named areas beside the map's own. check: whether to try some random starts, and to warn if they
-        show problems. The other arguments are those of the SDK's `policies.create`.
+        rooms: named areas beside the map's own, in the form of `regions`. check: whether to try some random
+        starts, and to warn if they show problems. The other arguments are those of the SDK's
+        `policies.create`.
         """
         grid, own = _read_world(world)
-        regions, robot, signals, options = map(plain, (regions, robot, signals, options))
+        regions, rooms, robot, signals, options = map(plain, (regions, rooms, robot, signals, options))
         made_robot = robot if isinstance(robot, Robot) else robot_from_json(robot)
-        task = make_task(grid, made_robot, formula, regions, {**own, **(rooms or {})}, signals)
+        named = {**own, **parse_regions(rooms or {}, "rooms")}
+        task = make_task(grid, made_robot, formula, regions, named, signals)
         seed = read_settings({"seed": seed})["seed"]
         how = METHODS.get(method)
         settings = read_options(how.options, options or {})

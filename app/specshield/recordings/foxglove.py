@@ -7,6 +7,7 @@ the frame `map`.
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from pathlib import Path
@@ -41,8 +42,8 @@ DECISION = {
 
 
 def write_mcap(recording: Recording, path: Path) -> None:
-    context = foxglove.Context()
-    with foxglove.open_mcap(path, allow_overwrite=True, context=context):
+    context, content = foxglove.Context(), io.BytesIO()  # foxglove raises no OSError for a file of its own
+    with foxglove.open_mcap(content, context=context):
         grids, poses = GridChannel("/map", context=context), PoseInFrameChannel("/pose", context=context)
         scenes = SceneUpdateChannel("/scene", context=context)
         schema = foxglove.Schema(
@@ -68,6 +69,7 @@ def write_mcap(recording: Recording, path: Path) -> None:
             scenes.log(fox.SceneUpdate(entities=lines), log_time=at)
             if item.decision is not None:
                 decisions.log(json.dumps(item.decision).encode(), log_time=at)
+    path.write_bytes(content.getvalue())
 
 
 def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:

@@ -14,8 +14,7 @@ from specshield.recordings.recording import Recording
 def write_rrd(recording: Recording, path: Path) -> None:
     """Writes the timelines `step` and `time`, `world` in metres, and scalars below `decision`."""
     stream = rerun.RecordingStream("specshield", recording_id=recording.id)
-    path.open("ab").close()  # raises OSError for a wrong path, which rerun would turn into a RuntimeError
-    stream.save(path)
+    held = stream.memory_recording()  # rerun's own files raise no OSError, and wait for ever on a full disk
     if recording.grid is not None:
         rows, columns = np.nonzero(recording.grid.occupied)
         centres = recording.grid.centres[rows, columns]
@@ -43,4 +42,4 @@ def write_rrd(recording: Recording, path: Path) -> None:
             stream.log("decision/distribution", rerun.BarChart(np.array(told["distribution"])))
             said = f"{told['mode']}: {told['action_name']} ({told['spec_status']})"
             stream.log("decision/log", rerun.TextLog(said))
-    stream.disconnect()
+    path.write_bytes(held.drain_as_bytes())

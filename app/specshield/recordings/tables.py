@@ -58,4 +58,5 @@ def write_parquet(recording: Recording, path: Path) -> None:
     schema = arrow.schema([(name, kind.get(name, arrow.float64())) for name in found[0]])
     table = arrow.Table.from_pylist(found, schema=schema)
     about = {"session": recording.id, "formula": recording.formula, "actions": ",".join(recording.actions)}
-    parquet.write_table(table.replace_schema_metadata(about), path)
+    with open(path, "wb") as file:  # pyarrow would remove a file that it cannot write to the end
+        parquet.write_table(table.replace_schema_metadata(about), file)

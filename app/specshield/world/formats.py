@@ -58,7 +58,7 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     wrong way, MapError for a member that is missing, unknown or wrong.
     """
     if name is None:
-        said = "the body does not say which format the map has"
+        said = "nothing says which format the map has"
         raise InputError(said, path="format", expected=f"one of {', '.join(FORMATS.names())}")
     format = FORMATS.get(str(name))
     if format.files != files:

@@ -118,7 +118,7 @@ class Claims:
         """Begins a deletion, from which on no use of the thing begins. Returns a policy that uses the map."""
         said = self._patiently("mark", kind, id, owner, token)
         if said == "none":
-            raise missing(kind, id, "an id")
+            raise missing(kind, id)
         return None if said == "marked" else said
 
     def free(self, kind: str, id: str, owner: str, token: str, map_id: str = "") -> bool:
@@ -198,8 +198,8 @@ def _key(*parts: str) -> str:
     return ":".join(("specshield:{library}", *parts))
 
 
-def missing(kind: str, key: str, asked: str = "an id or name") -> NotFound:
-    what, expected = "map" if kind == "maps" else "policy", f"{asked} from /v1/{kind}"
+def missing(kind: str, key: str) -> NotFound:
+    what, expected = "map" if kind == "maps" else "policy", f"an id or name from /v1/{kind}"
     return NotFound(f"there is no {what} {key!r}", path=f"{what}_id", got=key, expected=expected)
 
 

@@ -203,7 +203,7 @@ def _shipped(folder: Path) -> Iterator[Map]:
     for path in sorted(folder.glob("*.yaml")):
         try:
             grid, rooms = read_map_files(path)
-        except (SpecshieldError, ValueError) as error:
+        except SpecshieldError as error:
             log.warning("map %s is left out: %s", path, error)
             continue
         yield Map(_id(grid, rooms), grid, rooms, path.stem)

@@ -7,6 +7,7 @@ further step record would hold. Since a file may come from strangers, `read` bou
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Literal, NamedTuple
 
@@ -15,6 +16,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import InputError
+from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.sessions import record
 from specshield.service.sessions import rules as ruled
 from specshield.service.sessions.record import StepRecord
@@ -79,6 +81,8 @@ def read(content: bytes) -> Chain:
         configs, lines = ruled.read(file.config), file.config.split(b"\n")
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         raise _broken(None, "the file is no record of a session, or not all of one", WHERE) from None
+    if not all(re.fullmatch(ID, config.id) for config in configs):  # a command may name a file by it
+        raise _broken(None, "the session's id is none that a server would take", ID_TOLD)
     if msgspec.msgpack.encode(file) != content:
         raise _broken(None, "the file was changed: a server would write it otherwise", "the original bytes")
     names = columns(configs)
