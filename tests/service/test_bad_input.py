@@ -269,6 +269,16 @@ def test_a_house_with_an_unknown_asset(client, unchanged):
     assert "Sofa_1" in json.dumps(problem(client.post("/v1/maps", json=body), 422, "invalid-map"))
 
 
+def test_a_fault_as_large_as_an_upload_is_told_in_short(client, unchanged):
+    thing = {**HOUSE["objects"][0], "assetId": "é" * 1_000_000}
+    house = {"format": "procthor", "house": {**HOUSE, "objects": [thing]}, "asset_sizes": {}}
+    answer = client.post("/v1/maps", json=house)
+    assert problem(answer, 422, "invalid-map")["path"] == "house.objects[0].assetId"
+    assert len(answer.content) < 32_768
+    wrong = client.post("/v1/maps", json=changed(grid_json(), colour=[0] * 1_000_000))
+    assert problem(wrong, 422, "invalid-map", "colour")["got"] == "colour"
+
+
 @pytest.mark.parametrize(
     ("types", "path"),
     [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pickle
 import signal
 import socket
 import subprocess
@@ -48,6 +49,9 @@ def test_children_answer_fail_run_out_and_are_replaced() -> None:
         with pytest.raises(MapError) as wrong:  # our errors come back as they are
             await pool.run("specshield.world.checks:integer", 1.5, "data[0]", 0, 9, seconds=60.0)
         assert (wrong.value.path, wrong.value.got) == ("data[0]", 1.5)
+        with pytest.raises(MapError, match="aaa…") as wrong:  # but in short
+            await pool.run("specshield.world.checks:member", {}, "a" * 1_000_000, "", seconds=60.0)
+        assert len(pickle.dumps(wrong.value)) < 10_000
         with pytest.raises(StoreError, match="files cannot be used: No such file") as away:
             await pool.run("os:listdir", "/no/such/folder", seconds=60.0)
         assert "/no" not in str(away.value)
