@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from starlette.requests import Request
 
 from specshield.cores import cores
 from specshield.errors import Busy, MapError, ServerError, StoreError, TooExpensive
 from specshield.service.heavy.child import LENGTH
-from specshield.service.heavy.heavy import Heavy
+from specshield.service.heavy.heavy import TASKS, Heavy
 from specshield.service.heavy.pool import Pool, Template, Turns
 from specshield.service.heavy.threads import Threads
 from specshield.service.sessions.shields import Shields
@@ -266,6 +267,30 @@ def _once_there(shields: Shields, path: str) -> int:
     while not os.path.exists(path):
         time.sleep(0.01)
     return os.getpid()
+
+
+def test_an_owner_whose_uploads_fill_its_processes_keeps_nobody_else_waiting(tmp_path: Path) -> None:
+    os.mkfifo(endless := tmp_path / "endless")  # who reads it waits for a writer
+
+    async def scenario() -> None:
+        heavy = Heavy(Settings(data_dir=tmp_path, heavy_timeout=3600.0))
+
+        async def run(owner: str, *asked: Any) -> Any:
+            request = Request({"type": "http", "state": {"owner": owner}}, asyncio.Event().wait)  # type: ignore[arg-type]
+            return await heavy.run(request, *asked, owner)
+
+        try:
+            many = [asyncio.create_task(run("many", "check_policy", endless)) for _ in range(3 * TASKS)]
+            await asyncio.sleep(0)
+            checked = await asyncio.wait_for(run("few", "check_spec", b'{"formula": "x > 0"}'), HUNG)
+            assert checked["names"] == ["x"]
+            for each in many:
+                each.cancel()
+            await asyncio.gather(*many, return_exceptions=True)
+        finally:
+            heavy.close()
+
+    asyncio.run(scenario())
 
 
 def test_an_owner_whose_calls_fill_its_threads_keeps_nobody_else_waiting() -> None:

@@ -22,25 +22,30 @@ R = TypeVar("R")
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
 MOST_WAITING = 1000  # decisions of one session, or sessions with the same policies that begin, that may wait
-OWNERS = 2  # who may each keep all the processes for decisions busy that one owner may have
+TASKS = 2  # uploads and pictures of one owner at once
+OWNERS = 2  # who may each keep all the processes of a pool busy that one owner may have
 DECISION_TIMEOUT = 30.0  # [s]; the slowest known step takes 1 s, and the first may compile its kernels
 DECISION_MEMORY = 4 << 30  # [bytes]: for the tables of a few policies and of a look-ahead
 IDLE = 60.0  # [s] after the last call until a child ends, and until the template ends after the last child
 
 
 class Heavy:
-    """tasks: the pool for uploads and pictures. decisions: the pool for slow decisions, of which one owner
-    never has all processes: another owner's robot would wait for seconds.
+    """tasks: the pool for uploads and pictures. decisions: the pool for slow decisions. One owner never has
+    all processes of a pool: another one would wait for seconds, with a robot or for a small upload.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._template = settings, Template()
         pool, size = partial(Pool, self._template, unused=self._unused), max(cores(), 2)
-        self.tasks = pool(size=2, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=WAITING, idle=IDLE)
+        self.tasks = pool(
+            size=OWNERS * TASKS, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=TASKS, idle=IDLE
+        )
         self.decisions = pool(
             size=OWNERS * size, memory=DECISION_MEMORY, nice=DECISIONS_NICE, waiting=size, idle=10 * IDLE
         )
-        self._turns = defaultdict[str, Turns](lambda: Turns(size, MOST_WAITING))  # by owner
+        # By owner: the turns among its tasks, and those of its sessions among its decisions.
+        self._tasks = defaultdict[str, Turns](lambda: Turns(TASKS, WAITING))
+        self._decisions = defaultdict[str, Turns](lambda: Turns(size, MOST_WAITING))
 
     async def run(self, request: Request, function: str, *arguments: Any) -> Any:
         """Calls a function of heavy/uploads.py, or of another module beside it as in "pictures:draw_policy",
@@ -51,7 +56,8 @@ class Heavy:
         module, _, name = function.rpartition(":")
         asked = f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments
         seconds, owner = self._settings.heavy_timeout, request.scope["state"]["owner"]
-        work = asyncio.ensure_future(self.tasks.run(*asked, seconds=seconds, owner=owner))
+        call = self._tasks[owner].having(owner, self.tasks.run, *asked, seconds=seconds, owner=owner)
+        work = asyncio.ensure_future(call)
         gone = asyncio.ensure_future(until_gone(request.receive))
         try:
             await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
@@ -70,12 +76,9 @@ class Heavy:
         key: names what the process has to prepare, such as the policies: it is kept for further calls.
         """
         asked = "specshield.service.sessions.shields:call", self._settings, function, *args
-        turns = self._turns[owner := logs.owner()]
-        await turns.take(session)
-        try:
-            made: R = await self.decisions.run(*asked, seconds=DECISION_TIMEOUT, owner=owner, key=tuple(key))
-        finally:
-            turns.give()
+        owner = logs.owner()
+        limits = {"seconds": DECISION_TIMEOUT, "owner": owner, "key": tuple(key)}
+        made: R = await self._decisions[owner].having(session, self.decisions.run, *asked, **limits)
         return made
 
     def _unused(self, since: float) -> None:
