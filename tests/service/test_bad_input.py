@@ -383,6 +383,13 @@ def sent(weights=None, **card):
     return {"weights": ("w", files["weights"] if weights is None else weights), "card": ("c", files["card"])}
 
 
+def sent_case1(**card):
+    """The files of a policy that came with the server, which has tables."""
+    made = json.loads((shipped.MODELS / "case1" / "card.json").read_bytes())
+    weights = (shipped.MODELS / "case1" / "policy.safetensors").read_bytes()
+    return {"weights": ("w", weights), "card": ("c", json.dumps({**made, **card}).encode())}
+
+
 @pytest.mark.parametrize(
     ("files", "path"),
     [
@@ -392,6 +399,7 @@ def sent(weights=None, **card):
         (sent(seed="zero"), "card.seed"),
         (sent(robot="spot"), "card.robot"),
         (sent(options={"units": "many"}), "card.options.units"),
+        (sent_case1(options={"pitch": 2.0}), "card.options.pitch"),
         ({**sent(), "card": ("c", b"{")}, "card"),
         (sent(weights=b"\x80\x04\x95pickle"), "weights"),
         (sent(weights=policy_files()["weights"][:-8]), "weights"),
