@@ -5,7 +5,7 @@ import pytest
 from safetensors.numpy import save
 
 from specshield.errors import PolicyError
-from specshield.policy.tensors import read_tensors
+from specshield.policy.tensors import MAX_HEADER, read_tensors
 
 ARRAYS = {
     "cell": np.arange(12, dtype=np.int32).reshape(3, 4), "code": np.array([[7, 65535]], np.uint16),
@@ -59,3 +59,11 @@ def test_hostile_files_are_refused(tmp_path, content):
     for source in (content, tmp_path / "policy.safetensors"):
         with pytest.raises(PolicyError, match="safetensors"):
             read_tensors(source)
+
+
+def test_a_header_that_is_long_is_not_parsed():
+    entry = b'{"dtype": "U8", "shape": [0], "data_offsets": [0, 0]}'
+    names = b", ".join(b'"%d": %b' % (i, entry) for i in range(MAX_HEADER // len(entry)))
+    content = (len(names) + 2).to_bytes(8, "little") + b"{" + names + b"}"
+    with pytest.raises(PolicyError, match=f"header is larger than {MAX_HEADER} bytes"):
+        read_tensors(content)

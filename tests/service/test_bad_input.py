@@ -202,7 +202,7 @@ def test_parts_that_are_missing_or_too_many(client, unchanged):
     problem(client.post("/v1/maps", files=files), 422, "invalid-map", "image")
     files["image"] = ("i", PGM)
     more = problem(client.post("/v1/maps", files={**files, "more": ("m", b"x")}), 422, "invalid-map", "more")
-    assert more["got"] == "x"
+    assert more["got"] == "more"
     twice = [("metadata", ("m", YAML)), ("metadata", ("m", YAML))]
     problem(client.post("/v1/maps", files=twice), 422, "invalid-input", "body")
     problem(client.post("/v1/maps", files=files, data={"format": "procthor"}), 422, "invalid-input", "format")
@@ -267,6 +267,16 @@ HOUSE = {
 def test_a_house_with_an_unknown_asset(client, unchanged):
     body = {"format": "procthor", "house": HOUSE, "asset_sizes": {}}
     assert "Sofa_1" in json.dumps(problem(client.post("/v1/maps", json=body), 422, "invalid-map"))
+
+
+def test_a_fault_as_large_as_an_upload_is_told_in_short(client, unchanged):
+    thing = {**HOUSE["objects"][0], "assetId": "é" * 1_000_000}
+    house = {"format": "procthor", "house": {**HOUSE, "objects": [thing]}, "asset_sizes": {}}
+    answer = client.post("/v1/maps", json=house)
+    assert problem(answer, 422, "invalid-map")["path"] == "house.objects[0].assetId"
+    assert len(answer.content) < 32_768
+    wrong = client.post("/v1/maps", json=changed(grid_json(), colour=[0] * 1_000_000))
+    assert problem(wrong, 422, "invalid-map", "colour")["got"] == "colour"
 
 
 @pytest.mark.parametrize(
@@ -373,6 +383,13 @@ def sent(weights=None, **card):
     return {"weights": ("w", files["weights"] if weights is None else weights), "card": ("c", files["card"])}
 
 
+def sent_case1(**card):
+    """The files of a policy that came with the server, which has tables."""
+    made = json.loads((shipped.MODELS / "case1" / "card.json").read_bytes())
+    weights = (shipped.MODELS / "case1" / "policy.safetensors").read_bytes()
+    return {"weights": ("w", weights), "card": ("c", json.dumps({**made, **card}).encode())}
+
+
 @pytest.mark.parametrize(
     ("files", "path"),
     [
@@ -382,6 +399,7 @@ def sent(weights=None, **card):
         (sent(seed="zero"), "card.seed"),
         (sent(robot="spot"), "card.robot"),
         (sent(options={"units": "many"}), "card.options.units"),
+        (sent_case1(options={"pitch": 2.0}), "card.options.pitch"),
         ({**sent(), "card": ("c", b"{")}, "card"),
         (sent(weights=b"\x80\x04\x95pickle"), "weights"),
         (sent(weights=policy_files()["weights"][:-8]), "weights"),

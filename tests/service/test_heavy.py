@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pickle
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
 import pytest
+from starlette.requests import Request
 
+from specshield.cores import cores
 from specshield.errors import Busy, MapError, ServerError, StoreError, TooExpensive
 from specshield.service.heavy.child import LENGTH
+from specshield.service.heavy.heavy import TASKS, Heavy
 from specshield.service.heavy.pool import Pool, Template, Turns
-from tests.serving import children, wait_for
+from specshield.service.heavy.threads import Threads
+from specshield.service.sessions.shields import Shields
+from specshield.service.settings import Settings
+from specshield.service.watch import logs
+from tests.serving import HUNG, children, wait_for
 
 
 def run(
@@ -48,6 +59,9 @@ def test_children_answer_fail_run_out_and_are_replaced() -> None:
         with pytest.raises(MapError) as wrong:  # our errors come back as they are
             await pool.run("specshield.world.checks:integer", 1.5, "data[0]", 0, 9, seconds=60.0)
         assert (wrong.value.path, wrong.value.got) == ("data[0]", 1.5)
+        with pytest.raises(MapError, match="aaa…") as wrong:  # but in short
+            await pool.run("specshield.world.checks:member", {}, "a" * 1_000_000, "", seconds=60.0)
+        assert len(pickle.dumps(wrong.value)) < 10_000
         with pytest.raises(StoreError, match="files cannot be used: No such file") as away:
             await pool.run("os:listdir", "/no/such/folder", seconds=60.0)
         assert "/no" not in str(away.value)
@@ -224,6 +238,74 @@ def test_an_owner_has_so_many_waiting_and_no_more() -> None:
         await asyncio.gather(*waiting, another)
 
     asyncio.run(scenario())
+
+
+def test_an_owner_whose_slow_decisions_fill_its_processes_keeps_nobody_else_waiting(tmp_path: Path) -> None:
+    gate, open_gate = tmp_path / "gate", tmp_path
+
+    async def scenario() -> None:
+        heavy = Heavy(Settings(data_dir=tmp_path))
+
+        async def decide(owner: str, session: int, wanted: Path) -> int:
+            logs.request.set({"state": {"owner": owner}})
+            return await heavy.decide(_once_there, str(wanted), session=f"{session}", key=())
+
+        try:
+            many = [asyncio.create_task(decide("many", i, gate)) for i in range(3 * max(cores(), 2))]
+            await asyncio.sleep(0)
+            other = await asyncio.wait_for(asyncio.create_task(decide("few", 0, open_gate)), HUNG)
+            gate.touch()
+            assert other not in await asyncio.gather(*many)
+        finally:
+            heavy.close()
+
+    asyncio.run(scenario())
+
+
+def _once_there(shields: Shields, path: str) -> int:
+    """The process that this is called in, once there is a file at this path."""
+    while not os.path.exists(path):
+        time.sleep(0.01)
+    return os.getpid()
+
+
+def test_an_owner_whose_uploads_fill_its_processes_keeps_nobody_else_waiting(tmp_path: Path) -> None:
+    os.mkfifo(endless := tmp_path / "endless")  # who reads it waits for a writer
+
+    async def scenario() -> None:
+        heavy = Heavy(Settings(data_dir=tmp_path, heavy_timeout=3600.0))
+
+        async def run(owner: str, *asked: Any) -> Any:
+            request = Request({"type": "http", "state": {"owner": owner}}, asyncio.Event().wait)  # type: ignore[arg-type]
+            return await heavy.run(request, *asked, owner)
+
+        try:
+            many = [asyncio.create_task(run("many", "check_policy", endless)) for _ in range(3 * TASKS)]
+            await asyncio.sleep(0)
+            checked = await asyncio.wait_for(run("few", "check_spec", b'{"formula": "x > 0"}'), HUNG)
+            assert checked["names"] == ["x"]
+            for each in many:
+                each.cancel()
+            await asyncio.gather(*many, return_exceptions=True)
+        finally:
+            heavy.close()
+
+    asyncio.run(scenario())
+
+
+def test_an_owner_whose_calls_fill_its_threads_keeps_nobody_else_waiting() -> None:
+    threads, gate = Threads(), threading.Event()
+
+    def submit(owner: str, function: Callable[[], Any]) -> Future[Any]:
+        context = copy_context()
+        context.run(logs.request.set, {"state": {"owner": owner}})
+        return context.run(threads.submit, function)
+
+    many = [submit("many", gate.wait) for _ in range(3 * cores())]
+    assert all(submit(owner, lambda: "done").result(HUNG) == "done" for owner in ("few", ""))
+    assert threads.submit(lambda: "done").result(HUNG) == "done"  # outside of requests
+    gate.set()
+    assert all(each.result(HUNG) for each in many)
 
 
 async def _ends(pid: int) -> None:

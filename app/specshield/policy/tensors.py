@@ -19,6 +19,7 @@ KINDS = {
     "BOOL": np.bool_, "U8": np.uint8, "U16": np.uint16, "U32": np.uint32, "U64": np.uint64,
     "I8": np.int8, "I16": np.int16, "I32": np.int32, "I64": np.int64, "F32": np.float32, "F64": np.float64,
 }  # fmt: skip
+MAX_HEADER = 1 << 16  # [bytes], chosen by hand: a policy's has some 500, and to parse one of 60 MB takes a GB
 
 
 def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
@@ -27,7 +28,11 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
     Raises PolicyError for anything but safetensors.
     """
     try:
-        return _mapped(weights) if isinstance(weights, Path) else load(weights)
+        if isinstance(weights, Path):
+            return _mapped(weights)
+        if int.from_bytes(weights[:8], "little") > MAX_HEADER:
+            raise ValueError(f"their header is larger than {MAX_HEADER} bytes")
+        return load(weights)
     except Exception as error:  # the parser raises its own types for hostile bytes
         # No path of this machine is told: not as what was got, nor by an error of the system's.
         got = None if isinstance(weights, Path) else f"{len(weights)} bytes"

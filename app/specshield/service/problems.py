@@ -76,6 +76,7 @@ UNREADABLE: Mapping[type[Any], str] = {  # by the error of parsing: why a body i
     UnicodeDecodeError: "its text is not UTF-8",
     ValueError: "a number has too many digits",
 }
+LONGEST = 2000  # characters of a sentence that tells of an error from another process; chosen by hand
 LISTS = ("errors", "conjuncts")  # are not shortened, since their entries are short already
 
 
@@ -98,6 +99,17 @@ def document(error: SpecshieldError) -> dict[str, Any]:
     if error.expected is not None:
         body["expected"] = error.expected
     return body | {name: value if name in LISTS else plain(value) for name, value in error.details.items()}
+
+
+def shortened(error: SpecshieldError) -> SpecshieldError:
+    """The error, with no part of it longer than a problem document needs. What it was raised for may be as
+    large as an upload, such as a name in a map.
+    """
+    error.message = plain(error.message, LONGEST)
+    error.args = (error.message,)
+    error.path, error.got = plain(error.path), plain(error.got)
+    error.expected = plain(error.expected, LONGEST)
+    return error
 
 
 def plain(value: Any, room: int = 400) -> Any:

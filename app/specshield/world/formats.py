@@ -73,6 +73,6 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     for member in members:
         if member not in format.members:
             told, known = f"the format {name} has no such member", ", ".join(sorted(format.members))
-            raise MapError(told, path=str(member)[:200], got=members[member], expected=f"one of {known}")
+            raise MapError(told, path=str(member)[:200], got=member, expected=f"one of {known}")
     defaults = {member: schema["default"] for member, schema in format.members.items() if "default" in schema}
     return format.parse(**{**defaults, **members})

@@ -25,6 +25,7 @@ import sys
 from typing import Any
 
 from specshield.errors import SpecshieldError
+from specshield.service.problems import shortened
 from specshield.service.settings import Settings
 from specshield.service.storage.objects import unusable
 from specshield.service.watch import logs
@@ -94,7 +95,7 @@ def _call(call: bytes) -> tuple[Any, BaseException | None]:
         module, _, function = name.partition(":")
         return getattr(importlib.import_module(module), function)(*arguments), None
     except SpecshieldError as error:
-        return None, error.with_traceback(None)
+        return None, shortened(error).with_traceback(None)
     except MemoryError:
         return None, MemoryError()
     except OSError as error:

@@ -19,9 +19,9 @@ import subprocess
 import sys
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from specshield.errors import Busy, ServerError, TooExpensive
 from specshield.service.heavy.child import LENGTH, LIMITS, NOT_BEGUN
@@ -30,6 +30,7 @@ from specshield.service.heavy.child import LENGTH, LIMITS, NOT_BEGUN
 STARTS_WITHIN = 60  # [s] that a process may take to import everything on a busy machine
 MAY_GROW = 64 << 20  # [bytes] of additional memory after a call with which a child is not kept
 ENDED = asyncio.IncompleteReadError, ConnectionError  # raised for a process that has ended
+T = TypeVar("T")
 log = logging.getLogger("specshield")
 
 
@@ -135,6 +136,14 @@ class Turns:
                 line.remove(turn)
                 self._drop_if_empty(owner)
             raise
+
+    async def having(self, owner: str, call: Callable[..., Awaitable[T]], /, *args: Any, **kwargs: Any) -> T:
+        """The result of a call that is made when it is this caller's turn."""
+        await self.take(owner)
+        try:
+            return await call(*args, **kwargs)
+        finally:
+            self.give()
 
     def give(self) -> None:
         """Hands a turn on to the waiting owner that had one longest ago."""

@@ -177,8 +177,8 @@ class Policies(Claimed):
         card = {**card, "spec": record.about.spec}
         id = self._on_map(sent_id(_id(about, task), card, weights), about, task)
         card["id"] = id  # instead of the sender's
-        load_policy(weights, card, task)
         _check_options(about)
+        load_policy(weights, card, task)
         record = replace(record, id=id, card=card)
         if name is not None:
             self.check_name(name, record.id, key.name)

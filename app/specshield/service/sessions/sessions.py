@@ -7,7 +7,6 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -18,13 +17,13 @@ import numpy as np
 from specshield import __version__, episode
 from specshield.arrays import Floats
 from specshield.caution.signals import any_signal
-from specshield.cores import cores
 from specshield.episode import handover
 from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.heavy.threads import Threads
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SessionRequest
@@ -73,7 +72,7 @@ class Sessions:
     ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = Shields(policies, is_compiled)
-        self._threads = ThreadPoolExecutor(cores(), "decide")
+        self._threads = Threads()
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, self._shields, self._run, heavy, settings)
         self._heavy = heavy

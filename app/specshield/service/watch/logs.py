@@ -39,6 +39,12 @@ def tell(message: str, level: int = logging.INFO, /, **about: Any) -> None:
         log.log(level, message, extra={"about": about})
 
 
+def owner() -> str:
+    """Whose key the request that is being answered has shown; "" for none, and outside of requests."""
+    scope = request.get()
+    return "" if scope is None else scope["state"].get("owner", "")
+
+
 def config(form: str, level: str) -> dict[str, Any]:
     """The configuration for uvicorn and logging.config.dictConfig: all lines go to standard error."""
     kind = "specshield.service.watch.logs." + ("Json" if form == "json" else "Text")
