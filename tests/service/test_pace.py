@@ -1,8 +1,19 @@
 """Where a decision is made: on the event loop, on it with the processor's time measured, or in a thread."""
 
+import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from specshield.service.sessions.steps import LONG, SEVERAL, SHORT, WATCHED, Pace
+from specshield.service.heavy.uploads import policies_of
+from specshield.service.schemas.steps import StepBody
+from specshield.service.sessions.session import Session
+from specshield.service.sessions.shields import Shields
+from specshield.service.sessions.state import State
+from specshield.service.sessions.steps import LONG, SEVERAL, SHORT, WATCHED, Pace, decided, learns
+from specshield.service.settings import Settings
+from specshield.shield.decision import Config
+from specshield.shield.uncertainty import Uncertainty
+from tests.service.world import rule
 
 
 @pytest.fixture
@@ -57,3 +68,34 @@ def test_after_several_that_take_very_long_another_process_decides(known):
     assert not known.long
     known.add(2 * LONG, 2 * LONG)
     assert known.long
+
+
+def test_a_step_that_may_change_the_map_is_seen_before_it_is_decided(tmp_path):
+    """A search for a way around takes up to a tenth of a second, which no other robot is to wait for."""
+    shields = Shields(policies_of(Settings(data_dir=tmp_path)))
+    case = [rule(policy_ids=[shields.policies.find("case1", "").id])]
+    first = [4.5, 5.0, 0.0]
+    forward = [0.0] + [None] * 19  # logits of a model that drives on
+
+    def asked(t, pose, **more):
+        return StepBody(t, [pose], forward, **more)
+
+    def begun(**settings):
+        config = Config(uncertainty=Uncertainty(), max_steps=600, **settings)
+        new = Session(case, config, State(0, 0, True, "pending", 0.0, b""), b"", np.empty((0, 3)), [], 0, 0)
+        made = decided(shields, new._replace(rows=np.array([first])), asked(0, first))
+        state = replace(new.state, length=1, next_t=1, carry=made.decision.carry)
+        return new._replace(state=state, rows=np.array([first]))
+
+    session = begun(learn_map=True)
+    ahead = session.state.carry.next_poses[0].tolist()
+    assert ahead[0] > first[0] + 0.1
+    half = [0.5 * (a + b) for a, b in zip(first, ahead, strict=True)]
+    off = [ahead[0] + 0.004, *ahead[1:]]
+    assert [learns(shields, session, asked(1, pose)) for pose in (ahead, off, half)] == [False, False, True]
+    assert learns(shields, session, asked(1, ahead, occupied=[[1.0, 1.0]]))
+    assert not learns(shields, begun(learn_map=False), asked(1, half))
+    after = decided(shields, session, asked(1, half)).decision
+    assert after.map_revision > 0
+    later = session._replace(state=replace(session.state, carry=after.carry))
+    assert learns(shields, later, asked(2, half))

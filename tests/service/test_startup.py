@@ -191,14 +191,14 @@ def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_
     assert not shields.slow_policies([computed])
     settings, state = Config(threshold_over="episode"), State(0, 0, True, "pending", 0.0, b"")
     session = Session([rule(policy_ids=[computed])], settings, state, b"", np.empty((0, 3)), [], 0, 0)
-    assert shields.slow(session)
+    assert shields.slow(session, False)
     startup.completing = False  # as where it cannot be compiled
-    assert not shields.slow(session)
+    assert not shields.slow(session, False)
     startup.completing = True
-    assert shields.slow(session)
+    assert shields.slow(session, False)
     startup.parts += ["dqn", "chances"]
     assert not shields.slow_policies([learned])
-    assert not shields.slow(session)
+    assert not shields.slow(session, False)
     assert Startup().has("dqn")  # a server that is not to compile it
 
 

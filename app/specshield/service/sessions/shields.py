@@ -54,13 +54,15 @@ class Shields:
         self._preparing = Background("prepare")
         self._latest: Future[Preference] | None = None  # the last one that was asked for
 
-    def slow(self, session: Session) -> bool:
-        """Whether decisions take long and another process can make them, which has no prepared preference."""
+    def slow(self, session: Session, long: bool) -> bool:
+        """Whether decisions take long and another process can make them, which has no prepared preference.
+        long: whether earlier ones did.
+        """
         if session.rule.shaping != PROJECTION:
             return False
         over_episode = session.settings.threshold_over == "episode"
         compiles = over_episode and not self._is_compiled("chances")
-        return compiles or self.slow_policies(session.rule.policy_ids)
+        return long or compiles or self.slow_policies(session.rule.policy_ids)
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)
@@ -72,10 +74,6 @@ class Shields:
                 return True  # for now
             self._slow.put(key, slow)
         return slow
-
-    def note_slow(self, session: Session) -> None:
-        """From now on the decisions of sessions with these policies count as slow."""
-        self._slow.put(tuple(session.rule.policy_ids), True)
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
         def make() -> Shield:

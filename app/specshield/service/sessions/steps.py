@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.caution.taught import teach
 from specshield.episode.handover import check_signals
 from specshield.errors import SpecshieldError
 from specshield.service import metrics
@@ -169,17 +170,17 @@ class Steps:
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
-        ids = tuple(session.rule.policy_ids)
-        if self._shields.slow(session):
+        rule, ids = session.rule, tuple(session.rule.policy_ids)
+        # By owner, since another owner's robots may be on the map as it is, where decisions are short.
+        pace = self._paces.get((rule.owner, rule.shaping, *ids), Pace)
+        if self._shields.slow(session, pace.long):
             asked = timed, session, request
             made, seconds, _ = await self._heavy.decide(*asked, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
-        # A step may take long once the map is no longer the one that the policies were made for.
-        learns = bool(request.occupied or request.free or session.state.has_learned)
-        pace = self._paces.get((session.rule.shaping, *ids), Pace)
         cpu: float | None = None
-        if learns or not pace.short:
+        # A step may take long once the map is no longer the one that the policies were made for.
+        if (learned := learns(self._shields, session, request)) or not pace.short:
             run = asyncio.get_running_loop().run_in_executor
             made, seconds, cpu = await run(self._threads, timed, self._shields, session, request)
         elif pace.doubted:
@@ -189,11 +190,25 @@ class Steps:
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
         timing["rollout"] += seconds
-        if not learns:  # the time on a changed map says nothing about other sessions with these policies
+        if not learned:  # the time on a changed map says nothing about other sessions with these policies
             pace.add(seconds, cpu)
-            if pace.long:
-                self._shields.note_slow(session)
         return made
+
+
+def learns(shields: Shields, session: Session, request: StepBody) -> bool:
+    """Whether the session's own map will differ from its policies' map at this step. A robot that arrived
+    just where its action leads has met nothing, which is seen at once.
+    """
+    if request.occupied or request.free or session.state.has_learned:
+        return True
+    shield, carry = shields.of(session), session.state.carry
+    if not shield.config.learn_map or carry is None or carry.action is None:
+        return False
+    motion = shield.task.robot.motion_of[carry.action]
+    if motion >= 0 and carry.next_poses[motion].tolist() == request.poses[-1]:
+        return False
+    here = session.extended(request.t, np.array(request.poses, np.float64), {}).since[:, :3]
+    return teach(shield, carry, here, None, None)[0].map.revision > 0
 
 
 def timed(shields: Shields, session: Session, request: StepBody) -> tuple[Decided, float, float]:
