@@ -41,6 +41,7 @@ FAILURES = (redis.RedisError, redis.exceptions.RedisClusterException, OSError)
 CONNECTIONS = 64  # of one server process to a single store; further calls wait for one
 TRIES = 3  # after the first one, all within the caller's time limit. Chosen by hand.
 JOBS = "{specshield}:rq"  # how rq's keys begin in a cluster, so that one node of it has them all
+USER = "a user of the store with the rights that docs/scale.md lists"
 PORTS = {"sentinel": 26379, "cluster": 6379}
 
 
@@ -67,6 +68,8 @@ def naming(settings: Settings) -> Iterator[None]:
 
 
 def away(error: Exception) -> StoreError:
+    if isinstance(error, redis.exceptions.NoPermissionError):
+        return StoreError(f"the store refuses: {error!s:.200}", expected=USER)
     if isinstance(error, redis.ResponseError):  # its text says why: the memory is full, it is a replica, ...
         return StoreError(f"the store refuses: {error!s:.200}")
     return StoreError(f"the store cannot be reached: {type(error).__name__}")
