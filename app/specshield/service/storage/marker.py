@@ -13,7 +13,7 @@ from typing import Any
 
 from specshield.errors import InputError
 from specshield.service.storage.connect import connect, reaching
-from specshield.service.storage.objects import open_objects
+from specshield.service.storage.objects import open_objects, without_password
 
 FILE = "store-id"
 KEY = "specshield:store-id"
@@ -57,7 +57,7 @@ def check_first(store: Any, place: str) -> None:
 
 def _elsewhere(place: str) -> InputError:
     return InputError(
-        f"the servers of this store keep their maps and policies elsewhere than in {place}",
+        f"the servers of this store keep their maps and policies elsewhere than in {without_password(place)}",
         path="SPECSHIELD_DATA_URL",
         expected="one folder or URL for all servers and workers that share REDIS_URL. If these files are "
         f"the right ones, delete the key {KEY} from the store and start all of them again",
