@@ -60,7 +60,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ),
         (
             "serve",
-            {"SPECSHIELD_DATA_URL": "ftp://127.0.0.1:1/files"},
+            {"SPECSHIELD_DATA_URL": "ftp://robot:secret@127.0.0.1:1/files"},
             "files at 'ftp://127.0.0.1:1/files' cannot be used",
             "a folder, or a URL such as",
         ),
@@ -75,6 +75,18 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             {"SPECSHIELD_STORE_REPLICAS": "1"},
             "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
             "0 unless REDIS_URL is set",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_SESSION_TTL": f"1{18 * '0'}"},
+            "SPECSHIELD_SESSION_TTL is not valid",
+            "315360000",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_HEAVY_MEMORY": f"1{18 * '0'}"},
+            "SPECSHIELD_HEAVY_MEMORY is not valid",
+            "less ",
         ),
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         *(
