@@ -57,10 +57,11 @@ def processes(server: RunningServer) -> list[int]:
     return serve or [server.process.pid]
 
 
-def test_a_server_that_is_told_to_stop_does_so_when_its_time_is_over(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_server_that_is_told_to_stop_does_so_when_its_time_is_over(tmp_path, number):
     with serving(tmp_path, SPECSHIELD_DRAIN="1") as server:
         told = time.monotonic()
-        os.kill(server.process.pid, signal.SIGTERM)
+        os.kill(server.process.pid, number)
         assert server.process.wait(HUNG) == 0
         assert time.monotonic() - told >= 1.0
 
