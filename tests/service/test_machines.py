@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -89,6 +90,11 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
         assert len(done.stderr.strip().splitlines()) == 1
         assert "elsewhere than in" in done.stderr
     embedded.leave()
+    again = {"SPECSHIELD_DATA_URL": shared, "SPECSHIELD_LOG_FORMAT": "json"}
+    with serving(tmp_path / "another-store", **again) as server:  # may be right: the former one may be lost
+        lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    (told,) = (line["message"] for line in lines if line["level"] == "warning")
+    assert "the store does not know the files" in told
 
 
 def kept(tmp_path: Path, name: str) -> Kept:
