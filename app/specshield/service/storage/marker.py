@@ -44,8 +44,9 @@ def check_files(url: str, place: str, timeout: float) -> None:
             return
     if first:
         log.warning(
-            "the store does not know the files in %s, which were used with a store before: either it has lost "
-            "what it held, or this is another store. Sessions that ran in the other one are not found here",
+            "the store does not know the files in %s, which were used with a store before: either it has "
+            "lost what it held, or this is another store. Sessions that ran in the other one are not found "
+            "here",
             without_password(place),
         )
     deadline = time.monotonic() + WAIT
