@@ -1,12 +1,14 @@
 """The command without its parts, and with settings that cannot be."""
 
+import re
 import socket
 import subprocess
 import sys
 
+import httpx
 import pytest
 
-from tests.serving import HUNG, free_port, run_specshield
+from tests.serving import HUNG, free_port, run_specshield, serving, wait_for
 
 WITHOUT = """
 import sys
@@ -164,8 +166,23 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
 def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
     run = run_specshield("worker", cwd=tmp_path, REDIS_URL=f"redis://127.0.0.1:{free_port()}")
     assert run.returncode == 1
-    assert run.stderr.splitlines()[-1] == "REDIS_URL: the store cannot be reached: ConnectionError"
+    told = run.stderr.splitlines()[-1]
+    assert re.fullmatch(r"REDIS_URL: the store cannot be reached: ConnectionError \(.*refused\.\)", told)
     assert "Traceback" not in run.stderr
+
+
+def test_a_server_whose_store_is_away_tells_its_log_why_and_callers_only_that_it_is(tmp_path):
+    away = f"redis://robot:secret@127.0.0.1:{free_port()}"
+    with serving(tmp_path, ready=False, REDIS_URL=away) as server:
+        server.log.touch()
+        for line in ("Uvicorn running", "not ready yet"):
+            wait_for(lambda line=line: line in server.log.read_text())
+        told = httpx.get(f"{server.url}/readyz").text
+    log = server.log.read_text()
+    assert re.search(r"not ready yet, .* cannot be reached: ConnectionError \(.*127.0.0.1.* refused\.\)", log)
+    assert "cannot be reached" in told
+    assert "127.0.0.1" not in told
+    assert "secret" not in log + told
 
 
 @pytest.mark.parametrize("more", [[], ["--workers", "2"]])

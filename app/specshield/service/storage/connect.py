@@ -63,8 +63,18 @@ def naming(settings: Settings) -> Iterator[None]:
         yield
     except StoreError as error:
         if settings.redis_url is not None:
-            error.at("REDIS_URL")
+            with_cause(error).at("REDIS_URL")
         raise
+
+
+def with_cause(error: StoreError) -> StoreError:
+    """The same error, which now says why. For the log and for commands: the cause may name a host, which is
+    not for those who send requests.
+    """
+    cause = str(error.__cause__ or "")[:200]
+    if cause not in error.message:
+        error.message = f"{error.message} ({cause})"
+    return error
 
 
 def away(error: Exception) -> StoreError:
