@@ -25,7 +25,7 @@ import redis.connection
 import redis.exceptions
 import redis.retry
 import redis.sentinel
-from redis.backoff import ExponentialBackoff
+from redis.backoff import ExponentialBackoff, NoBackoff
 
 from specshield.errors import StoreError
 
@@ -126,6 +126,11 @@ def connect(url: str, blocking: bool = False, **options: Any) -> Any:
     if kind != "sentinel" or not 1 <= len(names) <= 2:
         raise ValueError("no such form")
     limits = {name: value for name, value in options.items() if name.startswith(("socket_", "ssl"))}
+    # A sentinel that is gone leaves time to ask the others: redis-py would try it again for seconds.
+    limits["retry"] = kit.retry.Retry(NoBackoff(), 0)
+    if (longest := options["socket_connect_timeout"]) is not None:
+        share = longest / (len(hosts) + 1)
+        limits |= {"socket_timeout": share, "socket_connect_timeout": share}
     sentinels = kit.sentinel.Sentinel(hosts, sentinel_kwargs=limits)
     return sentinels.master_for(names[0], db=int(names[1]) if names[1:] else 0, **options)
 
