@@ -163,11 +163,18 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
     assert "secret" not in line
 
 
-def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
-    run = run_specshield("worker", cwd=tmp_path, REDIS_URL=f"redis://127.0.0.1:{free_port()}")
+@pytest.mark.parametrize(
+    ("url", "cause"),
+    [
+        ("redis://127.0.0.1:{port}", r"ConnectionError \(.*refused\.\)"),
+        ("redis+sentinel://127.0.0.1:{port}/shield", r"MasterNotFoundError \(No master found for 'shield'\)"),
+    ],
+)
+def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path, url, cause):
+    run = run_specshield("worker", cwd=tmp_path, REDIS_URL=url.format(port=free_port()))
     assert run.returncode == 1
     told = run.stderr.splitlines()[-1]
-    assert re.fullmatch(r"REDIS_URL: the store cannot be reached: ConnectionError \(.*refused\.\)", told)
+    assert re.fullmatch(f"REDIS_URL: the store cannot be reached: {cause}", told)
     assert "Traceback" not in run.stderr
 
 

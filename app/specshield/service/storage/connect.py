@@ -71,7 +71,8 @@ def with_cause(error: StoreError) -> StoreError:
     """The same error, which now says why. For the log and for commands: the cause may name a host, which is
     not for those who send requests.
     """
-    cause = str(error.__cause__ or "")[:200]
+    # After " : <" redis-py shows its clients of the sentinels.
+    cause = str(error.__cause__ or "").partition(" : <")[0][:200]
     if cause not in error.message:
         error.message = f"{error.message} ({cause})"
     return error
