@@ -168,7 +168,8 @@ def behind_tls(folder: Path) -> Iterator[str]:
         ("--tls-cert-file", "ca.pem", "--tls-key-file", "key.pem", "--tls-ca-cert-file", "ca.pem"),
     )
     options = ("--port", "0", "--tls-port", str(port), "--tls-auth-clients", "no", *files, *DURABLE)
-    managed = ("--user", "managed", "on", ">secret", "~*", "&*", "+@all", "-@dangerous", "-@admin")
+    rights = ("~specshield:*", "~rq:*", "&rq:*", "+@all", "-@dangerous", "-@admin")  # as docs/scale.md lists
+    managed = ("--user", "managed", "on", ">secret", *rights)
     with running(folder, *options, *managed):
         url = f"rediss://managed:secret@127.0.0.1:{port}/0?ssl_ca_certs={folder / 'ca.pem'}"
         node = redis.Redis.from_url(url)

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import gc
 import json
+import logging.config
 import os
 import signal
 import socket
@@ -131,6 +132,8 @@ def serve(
     from specshield.service.watch import logs
 
     settings = _settings()  # errors in the settings end the command here, with one line
+    log_config = logs.config(settings.log_format, settings.log_level)
+    logging.config.dictConfig(log_config)  # for what comes before uvicorn, which does the same
     _check_address(host, port)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     with ThreadPoolExecutor(1) as beside:  # the store starts during the imports
@@ -154,7 +157,7 @@ def serve(
         "ws_max_queue": 8,
         "ws_per_message_deflate": False,
         "timeout_graceful_shutdown": GRACE,
-        "log_config": logs.config(settings.log_format, settings.log_level),
+        "log_config": log_config,
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
         "ws": "specshield.service.bounds.protocol:BoundedStream",
         "timeout_keep_alive": settings.keep_alive_timeout,

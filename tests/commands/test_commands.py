@@ -398,6 +398,26 @@ def test_a_store_that_drops_what_was_answered_is_told_of(tmp_path):
         assert not noted()
 
 
+def test_a_user_of_the_store_needs_the_rights_that_the_page_lists_and_what_is_missing_is_told(tmp_path):
+    page, port = (Path(__file__).parents[2] / "docs" / "scale.md").read_text(), free_port()
+    (told,) = re.findall(r"ACL SETUSER (specshield on >PASSWORD [^`]*)`", page)
+    with running(tmp_path / "redis", "--port", str(port), "--save", "") as _, redis.Redis(port=port) as store:
+        wait_for(lambda: answers(store))
+        store.execute_command("ACL", "SETUSER", *told.split())
+        at = f"redis://specshield:PASSWORD@127.0.0.1:{port}/0"
+        given = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data"), "REDIS_URL": at}
+        done = run_specshield("doctor", **given)
+        assert done.returncode == 0, done.stdout
+        store.execute_command("ACL", "SETUSER", "specshield", "resetkeys", "~specshield:*")
+        done = run_specshield("doctor", **given)
+        assert done.returncode == 1
+        assert re.search(r"wrong .*rq:queue:.* no permissions .*docs/scale.md", done.stdout), done.stdout
+        done = run_specshield("worker", **given)
+        assert done.returncode == 1
+        assert re.fullmatch(r"REDIS_URL: .* no permissions .*docs/scale.md.*", done.stderr.splitlines()[-1])
+        assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("command", ["watch", "policy", "export"])
 def test_help_says_where_the_key_of_a_server_comes_from(command):
     assert "SPECSHIELD_API_KEY" in run_specshield(command, "--help").stdout

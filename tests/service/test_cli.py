@@ -1,12 +1,14 @@
 """The command without its parts, and with settings that cannot be."""
 
+import re
 import socket
 import subprocess
 import sys
 
+import httpx
 import pytest
 
-from tests.serving import HUNG, free_port, run_specshield
+from tests.serving import HUNG, free_port, run_specshield, serving, wait_for
 
 WITHOUT = """
 import sys
@@ -60,7 +62,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ),
         (
             "serve",
-            {"SPECSHIELD_DATA_URL": "ftp://127.0.0.1:1/files"},
+            {"SPECSHIELD_DATA_URL": "ftp://robot:secret@127.0.0.1:1/files"},
             "files at 'ftp://127.0.0.1:1/files' cannot be used",
             "a folder, or a URL such as",
         ),
@@ -75,6 +77,18 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             {"SPECSHIELD_STORE_REPLICAS": "1"},
             "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
             "0 unless REDIS_URL is set",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_SESSION_TTL": f"1{18 * '0'}"},
+            "SPECSHIELD_SESSION_TTL is not valid",
+            "315360000",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_HEAVY_MEMORY": f"1{18 * '0'}"},
+            "SPECSHIELD_HEAVY_MEMORY is not valid",
+            "less ",
         ),
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         *(
@@ -149,11 +163,33 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
     assert "secret" not in line
 
 
-def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
-    run = run_specshield("worker", cwd=tmp_path, REDIS_URL=f"redis://127.0.0.1:{free_port()}")
+@pytest.mark.parametrize(
+    ("url", "cause"),
+    [
+        ("redis://127.0.0.1:{port}", r"ConnectionError \(.*refused\.\)"),
+        ("redis+sentinel://127.0.0.1:{port}/shield", r"MasterNotFoundError \(No master found for 'shield'\)"),
+    ],
+)
+def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path, url, cause):
+    run = run_specshield("worker", cwd=tmp_path, REDIS_URL=url.format(port=free_port()))
     assert run.returncode == 1
-    assert run.stderr.splitlines()[-1] == "REDIS_URL: the store cannot be reached: ConnectionError"
+    told = run.stderr.splitlines()[-1]
+    assert re.fullmatch(f"REDIS_URL: the store cannot be reached: {cause}", told)
     assert "Traceback" not in run.stderr
+
+
+def test_a_server_whose_store_is_away_tells_its_log_why_and_callers_only_that_it_is(tmp_path):
+    away = f"redis://robot:secret@127.0.0.1:{free_port()}"
+    with serving(tmp_path, ready=False, REDIS_URL=away) as server:
+        server.log.touch()
+        for line in ("Uvicorn running", "not ready yet"):
+            wait_for(lambda line=line: line in server.log.read_text())
+        told = httpx.get(f"{server.url}/readyz").text
+    log = server.log.read_text()
+    assert re.search(r"not ready yet, .* cannot be reached: ConnectionError \(.*127.0.0.1.* refused\.\)", log)
+    assert "cannot be reached" in told
+    assert "127.0.0.1" not in told
+    assert "secret" not in log + told
 
 
 @pytest.mark.parametrize("more", [[], ["--workers", "2"]])

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 
 import httpx
 import pytest
+import redis
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -17,7 +18,8 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
 from tests.service.test_bad_input import problem
 from tests.service.world import START, grid_json, send_policy
-from tests.serving import HUNG, run_specshield, serving, wait_for
+from tests.serving import HUNG, free_port, run_specshield, serving, wait_for
+from tests.stores import answers, needs_redis, running
 
 POSE = [4.5, 5.0, 0.0]  # from which case 1 can be satisfied
 UNTOLD = 12.0  # [s] in which a stream that is open tells nothing, if nothing is decided: less than HEARTBEAT
@@ -114,6 +116,28 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed, tmp_path):
     again = keys("revoke", "carol")
     assert again.returncode == 1
     assert "Traceback" not in again.stderr
+
+
+@needs_redis
+def test_a_change_of_keys_that_a_failover_may_undo_is_said_to_be_one(tmp_path):
+    port, second = free_port(), free_port()
+    given = {"REDIS_URL": f"redis://127.0.0.1:{port}", "SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+
+    def keys(*arguments, timeout):
+        more = {"SPECSHIELD_STORE_REPLICAS": "1", "SPECSHIELD_STORE_TIMEOUT": timeout}
+        return run_specshield("keys", *arguments, **given, **more)
+
+    with running(tmp_path / "first", "--port", str(port)), redis.Redis(port=port) as first:
+        wait_for(lambda: answers(first))
+        made = keys("create", "carol", timeout="1")
+        assert (made.returncode, made.stdout[:3]) == (1, "ss_")  # nobody could read the key later
+        assert "the keys are changed, but a failover may undo that" in made.stderr
+        follows = ("--replicaof", f"127.0.0.1 {port}", "--repl-diskless-sync-delay", "0")
+        with running(tmp_path / "second", "--port", str(second), *follows), redis.Redis(port=second) as other:
+            wait_for(lambda: answers(other) and other.info()["master_link_status"] == "up")
+            assert other.hexists(KEYS, "carol")
+            revoked = keys("revoke", "carol", timeout="60")
+            assert (revoked.returncode, other.hexists(KEYS, "carol")) == (0, False), revoked.stderr
 
 
 def test_a_revoked_key_ends_the_streams_of_events_that_it_opened_and_no_other(keyed):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -57,10 +58,11 @@ def processes(server: RunningServer) -> list[int]:
     return serve or [server.process.pid]
 
 
-def test_a_server_that_is_told_to_stop_does_so_when_its_time_is_over(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_server_that_is_told_to_stop_does_so_when_its_time_is_over(tmp_path, number):
     with serving(tmp_path, SPECSHIELD_DRAIN="1") as server:
         told = time.monotonic()
-        os.kill(server.process.pid, signal.SIGTERM)
+        os.kill(server.process.pid, number)
         assert server.process.wait(HUNG) == 0
         assert time.monotonic() - told >= 1.0
 
@@ -88,6 +90,11 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
         assert len(done.stderr.strip().splitlines()) == 1
         assert "elsewhere than in" in done.stderr
     embedded.leave()
+    again = {"SPECSHIELD_DATA_URL": shared, "SPECSHIELD_LOG_FORMAT": "json"}
+    with serving(tmp_path / "another-store", **again) as server:  # may be right: the former one may be lost
+        lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    (told,) = (line["message"] for line in lines if line["level"] == "warning")
+    assert "the store does not know the files" in told
 
 
 def kept(tmp_path: Path, name: str) -> Kept:

@@ -7,10 +7,12 @@ import gc
 import json
 import os
 import signal
+import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from threading import Thread
 from typing import Any
 
 import httpx
@@ -187,6 +189,35 @@ def test_a_life_under_sentinels_that_name_another_server(tmp_path):
 def test_a_life_behind_tls(tmp_path):
     with behind_tls(tmp_path / "store") as url, on_store(tmp_path, url) as server:
         a_whole_life(server, tmp_path, url)
+
+
+def test_a_sentinel_that_is_gone_is_asked_once_and_then_the_next(tmp_path):
+    """Else the seconds in which redis-py asks it again would be more than the service waits for the store."""
+    asked = 0
+
+    def close_each() -> None:
+        nonlocal asked
+        with suppress(OSError):  # the end of the block has closed the socket
+            while True:
+                gone.accept()[0].close()
+                asked += 1
+
+    async def ping(url: str) -> None:
+        store = Store(url, timeout=60.0, ttl=60)
+        await store.ping()
+        await store.aclose()
+
+    with watched(tmp_path) as there, socket.create_server(("127.0.0.1", 0)) as gone:
+        Thread(target=close_each, daemon=True).start()
+        url = there.url.replace("//", f"//127.0.0.1:{gone.getsockname()[1]},")
+        with connect(url, blocking=True, socket_timeout=60.0) as store:
+            assert store.ping()
+            limits = store.connection_pool.sentinel_manager.sentinels[0].connection_pool.connection_kwargs
+        assert asked == 1
+        asyncio.run(ping(url))
+        assert asked == 2
+    names = ("socket_timeout", "socket_connect_timeout")
+    assert [limits[name] for name in names] == [20.0, 20.0]  # of 60 s, for two sentinels and the store
 
 
 async def refused(call: Callable[[], Awaitable[object]]) -> None:

@@ -157,6 +157,7 @@ def _disk(settings: Settings) -> Iterator[Finding]:
 def _store(settings: Settings) -> Iterator[Finding]:
     from specshield.service.storage.connect import FAILURES, connect, drops
     from specshield.service.storage.marker import check_first
+    from specshield.service.training.jobs import Jobs
 
     if settings.redis_url is None:  # see `_disk`
         return
@@ -171,6 +172,7 @@ def _store(settings: Settings) -> Iterator[Finding]:
             if (told := drops(store)) is not None:
                 yield Finding("note", told, "maxmemory-policy noeviction, at the store (docs/scale.md)")
             check_first(store, settings.files_at)
+            Jobs(settings).counts()  # reads rq's keys, which the store may keep from its user
     except FAILURES as error:
         yield Finding(
             "wrong", f"the store at REDIS_URL does not answer: {error!s:.200}", "start it, or mend REDIS_URL"

@@ -36,7 +36,8 @@ class Streams:
 
 def heed_signals(startup: Startup, streams: Streams, drain: float) -> None:
     """After SIGTERM, /readyz answers 503 and everything else goes on; `drain` seconds later the streams are
-    closed and the server stops. SIGINT, or a SIGTERM more than ECHO later, stops it at once.
+    closed and the server stops. SIGINT, or a SIGTERM more than ECHO later, stops it at once. SIGHUP, as of a
+    terminal that is closed, counts as SIGTERM, unless it is ignored (nohup).
 
     To be called in the server's event loop, where uvicorn's handlers are set. Does nothing outside the main
     thread: there the server is part of another program.
@@ -62,6 +63,8 @@ def heed_signals(startup: Startup, streams: Streams, drain: float) -> None:
 
     for number in uvicorns:
         signal.signal(number, told)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, lambda _, frame: told(signal.SIGTERM, frame))
 
 
 def notice_killed() -> None:

@@ -21,6 +21,8 @@ ALIKE = 0.9  # difflib's ratio for a misspelt name; Kubernetes' SPECSHIELD_PORT,
 Count = Annotated[int, Field(ge=1)]
 AnyCount = Annotated[int, Field(ge=0)]
 Seconds = Annotated[float, Field(gt=0, le=24 * 3600)]  # timers do not take every number
+# At most ten years: the store, the calendar and the alarms of a process do not take every number [s].
+LongSeconds = Annotated[int, Field(ge=1, le=10 * 365 * 24 * 3600)]
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
@@ -67,7 +69,7 @@ class Settings(BaseSettings):
     keep_alive_timeout: Seconds = 30.0  # a connection without a request is closed after this long
     heavy_timeout: Seconds = 20.0  # longest that reading an upload or drawing a map may take
     # Most memory of a process that reads an upload or draws a map [bytes].
-    heavy_memory: int = Field(1 << 30, ge=256 << 20)
+    heavy_memory: int = Field(1 << 30, ge=256 << 20, le=1 << 50)
 
     max_owner_bytes: AnyCount = 8 << 30  # most that one key's maps and policies take on the disk
     max_stored_bytes: AnyCount = 32 << 30  # most that all maps and policies take on the disk
@@ -76,10 +78,10 @@ class Settings(BaseSettings):
     max_maps: Count = 1000  # most uploaded maps kept
     max_policies: Count = 1000  # most policies kept
     max_sessions: Count = 100_000  # most sessions in the store; those in the archive do not count
-    session_ttl: Count = 7 * 24 * 3600  # a session is erased this long after its last change [s]
+    session_ttl: LongSeconds = 7 * 24 * 3600  # a session is erased this long after its last change [s]
     # A session that has not changed for so long moves to the archive [s]; an ended one does after 60 s if
     # this is longer.
-    archive_after: Count = 3600
+    archive_after: LongSeconds = 3600
     # Once the archive has so many bytes, no session moves there and none is begun.
     archive_bytes: int = Field(100 << 30, ge=1 << 20)
     # Once one key's sessions take so many bytes of the archive, it can begin none.
@@ -93,8 +95,8 @@ class Settings(BaseSettings):
 
     worker: bool | None = None  # whether to start a training worker; by default, if the store is embedded
     complete: bool = True  # whether to compile, once ready, the kernels that only some sessions need
-    training_timeout: Count = 6 * 3600  # longest training run of a method that learns [s]
-    synthesis_timeout: Count = 600  # longest run of a method that computes its policies [s]
+    training_timeout: LongSeconds = 6 * 3600  # longest training run of a method that learns [s]
+    synthesis_timeout: LongSeconds = 600  # longest run of a method that computes its policies [s]
 
     @field_validator("models_dir", "maps_dir")
     @classmethod

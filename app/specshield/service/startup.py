@@ -26,6 +26,7 @@ from specshield import compiled
 from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
+from specshield.service.storage.connect import with_cause
 from specshield.service.storage.keeper import private
 
 # The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; the file `complete`,
@@ -175,7 +176,7 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
                 await asyncio.to_thread(check)
                 break
             except StoreError as error:
-                if said != (said := str(error)):
+                if said != (said := str(with_cause(error))):
                     log.warning("not ready yet, and trying again: %s", said)
             await asyncio.sleep(CHECK_EVERY)
         startup.ready = True

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from specshield.errors import StoreError
+
 if TYPE_CHECKING:
     from specshield.service.access.keys import Keys
     from specshield.service.settings import Settings
@@ -31,7 +33,11 @@ def create(
     bytes: Annotated[int | None, typer.Option(help="Most bytes of maps and policies kept.", min=0)] = None,
 ) -> None:
     """Make a key and print it: it cannot be read again."""
-    print(on_keys(lambda keys: keys.create(name, requests=requests, sessions=sessions, bytes=bytes)))
+
+    async def made(keys: Keys) -> None:
+        print(await keys.create(name, requests=requests, sessions=sessions, bytes=bytes))
+
+    on_keys(made, changes=True)
 
 
 @app.command("list")
@@ -50,30 +56,43 @@ def show() -> None:
 @app.command()
 def revoke(name: Name) -> None:
     """Revoke a key: servers refuse it within 2 s. What was made with it is kept."""
-    _on_keys_there(lambda keys: keys.revoke(name))
+    _on_keys_there(lambda keys: keys.revoke(name), changes=True)
     print(f"the key {name} is revoked")
 
 
-def _on_keys_there(action: Callable[[Keys], Awaitable[R]]) -> R:
+def _on_keys_there(action: Callable[[Keys], Awaitable[R]], changes: bool = False) -> R:
     """As `on_keys`. Where there is no data folder, none is made."""
     from specshield.service.settings import read_settings
 
     with TemporaryDirectory(prefix="specshield-") as folder:
-        return on_keys(action, read_settings().or_empty(folder))
+        return on_keys(action, read_settings().or_empty(folder), changes)
 
 
-def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None) -> R:
-    """The result of an action on the keys of the store. Raises StoreError."""
+def on_keys(
+    action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None, changes: bool = False
+) -> R:
+    """The result of an action on the keys of the store. changes: whether it changes them, which has to reach
+    as many replicas as the settings ask for. Raises StoreError.
+    """
     from specshield.service.access.keys import Keys
     from specshield.service.settings import read_settings
-    from specshield.service.storage.connect import connect, naming
+    from specshield.service.storage.connect import naming
     from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.storage.store import Store
 
     settings = settings or read_settings()
 
     async def act() -> R:
-        async with aclosing(connect(settings.store_url, socket_timeout=settings.store_timeout)) as store:
-            return await action(Keys(store))
+        of = settings.store_url, settings.store_timeout, settings.session_ttl, settings.store_replicas
+        async with aclosing(Store(*of)) as store:
+            result = await action(Keys(store.redis))
+            try:
+                if changes:
+                    await store.follow()
+            except StoreError as error:
+                told = f"the keys are changed, but a failover may undo that: {error.message}"
+                raise error.retold(told) from error
+            return result
 
     with ExitStack() as opened:
         if settings.redis_url is None:

@@ -25,7 +25,7 @@ import redis.connection
 import redis.exceptions
 import redis.retry
 import redis.sentinel
-from redis.backoff import ExponentialBackoff
+from redis.backoff import ExponentialBackoff, NoBackoff
 
 from specshield.errors import StoreError
 
@@ -41,6 +41,7 @@ FAILURES = (redis.RedisError, redis.exceptions.RedisClusterException, OSError)
 CONNECTIONS = 64  # of one server process to a single store; further calls wait for one
 TRIES = 3  # after the first one, all within the caller's time limit. Chosen by hand.
 JOBS = "{specshield}:rq"  # how rq's keys begin in a cluster, so that one node of it has them all
+USER = "a user of the store with the rights that docs/scale.md lists"
 PORTS = {"sentinel": 26379, "cluster": 6379}
 
 
@@ -62,11 +63,24 @@ def naming(settings: Settings) -> Iterator[None]:
         yield
     except StoreError as error:
         if settings.redis_url is not None:
-            error.at("REDIS_URL")
+            with_cause(error).at("REDIS_URL")
         raise
 
 
+def with_cause(error: StoreError) -> StoreError:
+    """The same error, which now says why. For the log and for commands: the cause may name a host, which is
+    not for those who send requests.
+    """
+    # After " : <" redis-py shows its clients of the sentinels.
+    cause = str(error.__cause__ or "").partition(" : <")[0][:200]
+    if cause not in error.message:
+        error.message = f"{error.message} ({cause})"
+    return error
+
+
 def away(error: Exception) -> StoreError:
+    if isinstance(error, redis.exceptions.NoPermissionError):
+        return StoreError(f"the store refuses: {error!s:.200}", expected=USER)
     if isinstance(error, redis.ResponseError):  # its text says why: the memory is full, it is a replica, ...
         return StoreError(f"the store refuses: {error!s:.200}")
     return StoreError(f"the store cannot be reached: {type(error).__name__}")
@@ -113,6 +127,11 @@ def connect(url: str, blocking: bool = False, **options: Any) -> Any:
     if kind != "sentinel" or not 1 <= len(names) <= 2:
         raise ValueError("no such form")
     limits = {name: value for name, value in options.items() if name.startswith(("socket_", "ssl"))}
+    # A sentinel that is gone leaves time to ask the others: redis-py would try it again for seconds.
+    limits["retry"] = kit.retry.Retry(NoBackoff(), 0)
+    if (longest := options["socket_connect_timeout"]) is not None:
+        share = longest / (len(hosts) + 1)
+        limits |= {"socket_timeout": share, "socket_connect_timeout": share}
     sentinels = kit.sentinel.Sentinel(hosts, sentinel_kwargs=limits)
     return sentinels.master_for(names[0], db=int(names[1]) if names[1:] else 0, **options)
 

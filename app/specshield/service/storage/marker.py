@@ -6,6 +6,7 @@ start. All calls block.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import time
 from contextlib import closing
@@ -13,11 +14,12 @@ from typing import Any
 
 from specshield.errors import InputError
 from specshield.service.storage.connect import connect, reaching
-from specshield.service.storage.objects import open_objects
+from specshield.service.storage.objects import open_objects, without_password
 
 FILE = "store-id"
 KEY = "specshield:store-id"
 WAIT = 5.0  # [s] for another server, whose first start is under way, to write the file
+log = logging.getLogger("specshield")
 
 
 def check_files(url: str, place: str, timeout: float) -> None:
@@ -40,6 +42,13 @@ def check_files(url: str, place: str, timeout: float) -> None:
                 store.delete(KEY)
                 raise
             return
+    if first:
+        log.warning(
+            "the store does not know the files in %s, which were used with a store before: either it has "
+            "lost what it held, or this is another store. Sessions that ran in the other one are not found "
+            "here",
+            without_password(place),
+        )
     deadline = time.monotonic() + WAIT
     while mine is None and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -57,7 +66,7 @@ def check_first(store: Any, place: str) -> None:
 
 def _elsewhere(place: str) -> InputError:
     return InputError(
-        f"the servers of this store keep their maps and policies elsewhere than in {place}",
+        f"the servers of this store keep their maps and policies elsewhere than in {without_password(place)}",
         path="SPECSHIELD_DATA_URL",
         expected="one folder or URL for all servers and workers that share REDIS_URL. If these files are "
         f"the right ones, delete the key {KEY} from the store and start all of them again",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -36,9 +37,18 @@ def open_objects(place: str) -> Objects:
         return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
     except (ImportError, ValueError, OSError) as error:  # OSError: the server of the URL cannot be reached
         raise InputError(
-            f"files at {place!r} cannot be used: {error}",
+            f"files at {without_password(place)!r} cannot be used: {error}",
             expected="a folder, or a URL such as s3://bucket/prefix with the package that reads it (s3fs)",
         ) from None
+
+
+def without_password(place: str) -> str:
+    """The place for logs and answers.
+
+    >>> without_password("ftp://robot:secret@host/files")
+    'ftp://host/files'
+    """
+    return re.sub(r"(?<=://)[^/]*@", "", place)
 
 
 def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:

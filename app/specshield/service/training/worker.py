@@ -70,7 +70,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
             command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
             second = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=held)
 
-    with _regularly(live):
+    with _regularly(live), reaching():
         _Worker(url, jobs, methods, others if learner else ()).work(logging_level="WARNING")
     raise StoreError(
         "the worker lost the store and cannot go on; rq's last lines in the log say why",
@@ -94,7 +94,6 @@ class _Worker(Worker):
 
     max_connection_wait_time = 1.0  # [s] between two tries to reach the store; rq would wait up to 60 s
 
-    @reaching()
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]
         # A client of its own: rq waits for work longer than any answer of the store may take, and sets the

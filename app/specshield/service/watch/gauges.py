@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
 import anyio
@@ -13,6 +14,7 @@ from specshield.service.training.jobs import Jobs
 
 Kind = type[GaugeMetricFamily] | type[CounterMetricFamily]
 KEPT_FOR = 2.0  # [s] for which the values of a scrape answer further ones; chosen by hand
+log = logging.getLogger("specshield")
 
 
 class Gauges:
@@ -29,7 +31,8 @@ class Gauges:
             if time.monotonic() - self._asked > KEPT_FOR:
                 try:
                     self._found = await self._families()
-                except StoreError:
+                except StoreError as error:
+                    log.warning("/metrics tells nothing of the store now: %s", error)
                     self._found = [_up(0)]
                 self._asked = time.monotonic()
         return self._found
