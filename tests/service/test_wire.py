@@ -6,7 +6,9 @@ import hiredis
 import pytest
 import redis
 
-from specshield.service.storage.wire import Script, Wire, _Link
+from specshield.errors import StoreError
+from specshield.service.storage.connect import reaching
+from specshield.service.storage.wire import PART, Script, Wire, _Link
 
 
 def test_an_answer_that_comes_too_late_is_nobody_elses():
@@ -56,6 +58,30 @@ def test_a_server_that_can_wait_for_no_replica_any_more_is_left():
         server.close()
 
     asyncio.run(scene())
+
+
+def test_a_refusal_is_told_at_once_with_its_reason():
+    """Though replicas are waited for: nothing was written that they could lack."""
+
+    async def scene():
+        async def read_only(reader, writer):
+            while await reader.read(65536):
+                writer.write(b"-READONLY You can't write against a read only replica.\r\n")
+
+        server = await asyncio.start_server(read_only, "127.0.0.1", 0)
+
+        class Connection:
+            async def connect(self):
+                _, self._writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+
+        wire = Wire(Connection, 60.0, 1)
+        with pytest.raises(StoreError, match="the store refuses: READONLY"), reaching():
+            await wire.run(Script("return 1"), [], [])
+        server.close()
+
+    began = time.monotonic()
+    asyncio.run(scene())
+    assert time.monotonic() - began < 0.5 * PART * 60.0
 
 
 def test_a_server_that_goes_while_a_connection_is_made_cannot_be_reached():

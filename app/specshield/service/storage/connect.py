@@ -78,7 +78,9 @@ def with_cause(error: StoreError) -> StoreError:
     return error
 
 
-def away(error: Exception) -> StoreError:
+def away(error: BaseException) -> StoreError:
+    if isinstance(error.__cause__, redis.ResponseError):  # a connection was given up because of this reply
+        error = error.__cause__
     if isinstance(error, redis.exceptions.NoPermissionError):
         return StoreError(f"the store refuses: {error!s:.200}", expected=USER)
     if isinstance(error, redis.ResponseError):  # its text says why: the memory is full, it is a replica, ...

@@ -97,8 +97,8 @@ async def _run(link: _Link, script: Script, keys: Sequence[str], args: Sequence[
 class _Link(asyncio.Protocol):
     """An open connection, taken over from redis-py; `closed` once it cannot be used any more.
 
-    With `replicas`, each round of commands ends with a WAIT, and their answers are held until the server says
-    how many replicas have followed.
+    With `replicas`, each round of commands ends with a WAIT. Their answers are held until the server says how
+    many replicas have followed; errors are not.
     """
 
     def __init__(self, connection: Any, replicas: int = 0) -> None:
@@ -153,7 +153,7 @@ class _Link(asyncio.Protocol):
             answer, _ = self._waiting.popleft()
             if answer is None:
                 self._release(found)
-            elif self._replicas:
+            elif self._replicas and not isinstance(found, hiredis.ReplyError):
                 self._held.append((answer, found))
             else:
                 _give(answer, found)
@@ -164,7 +164,7 @@ class _Link(asyncio.Protocol):
             self.close()
             return
         for answer, found in self._held:
-            if count < self._replicas and not isinstance(found, hiredis.ReplyError):
+            if count < self._replicas:
                 found = too_few(count, self._replicas)
             _give(answer, found)
         self._held.clear()
