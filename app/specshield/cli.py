@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import json
 import os
@@ -80,6 +81,8 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
         StatusLine().clear()  # a command may have left a line there
         sys.exit(str(error))
     except OSError as error:
+        if error.errno == errno.ENOSPC:  # found while it was written, which does not tell the file's name
+            sys.exit(f"A file could not be written: {error.strerror}")
         if error.filename is None:  # with a name, it is most likely a file or folder that the caller named
             raise
         sys.exit(f"{error.filename} cannot be used: {error.strerror}")
