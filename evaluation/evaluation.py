@@ -112,8 +112,8 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
 
 
 def finished(file: Path, make: Callable[[Any], T]) -> list[T]:
-    """As `whole_lines`; nothing where there is no file. A last line that a kill has cut short is taken off, so
-    that the next one can be added.
+    """As `whole_lines`; nothing where there is no file. A last line that a kill has cut short is taken off,
+    so that the next one can be added.
     """
     if not file.exists():
         return []
@@ -125,15 +125,17 @@ def whole_lines(file: Path, make: Callable[[Any], T]) -> list[T]:
     """What `make` makes of the JSON of each line; a last line that was cut short does not count. Raises
     InputError for a line that is damaged, or was written by a version whose records had other fields.
     """
-    found = []
-    for number, line in enumerate(file.read_bytes().split(b"\n")[:-1], 1):
-        try:
+    lines, found = file.read_bytes().split(b"\n")[:-1], list[T]()
+    try:
+        for line in lines:
             found.append(make(json.loads(line)))
-        except (ValueError, TypeError, KeyError):
-            raise InputError(
-                f"line {number} of {file} is not a run of this version", path="out", got=repr(line[:40]),
-                expected="another --out; or delete that line, and its run is made again",
-            ) from None  # fmt: skip
+    except (ValueError, TypeError, KeyError):
+        number = len(found) + 1
+        raise InputError(
+            f"line {number} of {file} is not a run of this version", path="out",
+            got=repr(lines[len(found)][:40]),
+            expected="another --out; or delete that line, and its run is made again",
+        ) from None  # fmt: skip
     return found
 
 
