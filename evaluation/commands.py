@@ -187,11 +187,19 @@ def rewards(
 ) -> None:
     """Train the learned policy with the paper's reward and with ours, and compare what comes of them."""
     from evaluation.rewards import REWARDS, all_of, compare
+    from specshield.sim.cases import load_case
 
     _check_page(page)
     _some(reward, REWARDS, "--reward")
-    whole = [int(seed) for seed in _numbers(seeds, "--seeds")]
-    compare(all_of(case, reward, whole, updates), runs, out, page)
+    numbers = _numbers(seeds, "--seeds")
+    if not all(number >= 0.0 and number.is_integer() for number in numbers):
+        raise InputError(
+            "not all are whole numbers of 0 or more", path="--seeds", got=seeds, expected="as 0,1"
+        )
+    trainings = all_of(case, reward, [int(number) for number in numbers], updates)
+    for each in trainings:  # a case that does not exist is refused now, and not after hours of training
+        load_case(each.case)
+    compare(trainings, runs, out, page)
 
 
 def curves(
@@ -222,6 +230,8 @@ def curves(
         for one in case.split(",")
         for name in model.split(",")
     ]
+    for each in asked:  # a case that does not exist is refused now, and not after hours of runs
+        _ = each.setting
     draw_all(
         asked,
         _numbers(thresholds, "--thresholds"),

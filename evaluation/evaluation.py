@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from evaluation import jobs
 from evaluation.experiment import Experiment
@@ -22,8 +22,9 @@ from specshield.errors import InputError
 from specshield.policy.tensors import replace_file
 from specshield.sim.campaign import each_done
 
-ABOUT = "experiment.json"
+ABOUT, RUNS = "experiment.json", "runs.jsonl"
 Missing = Mapping[int, Sequence[str]]  # {run: methods}
+T = TypeVar("T")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -56,7 +57,7 @@ def evaluate(
     for finished, records in enumerate(made, runs - len(missing) + 1):
         done.update({(record.run, record.method): record for record in records})
         if folder is not None:
-            _keep(folder, records)
+            add_lines(folder / RUNS, [record.to_json() for record in records])
         on_progress(finished)
     return [done[i, name] for i in range(runs) for name in methods]
 
@@ -102,29 +103,56 @@ def _end_with_parent() -> None:
 def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:
     """The records that `folder` holds. It is made, with a description of the experiment, where it is new."""
     folder.mkdir(parents=True, exist_ok=True)
-    about, written = folder / ABOUT, folder / "runs.jsonl"
+    about, written = folder / ABOUT, folder / RUNS
     check(folder, experiment)
     if not about.exists():
         described = {**experiment.to_json(), "made_from": experiment.setting.made_from}
         replace_file(about, (json.dumps(described) + "\n").encode())
-    records = map(Record.from_json, finished(written))
-    return {(record.run, record.method): record for record in records}
+    return {(record.run, record.method): record for record in finished(written, Record.from_json)}
 
 
-def finished(file: Path) -> list[Any]:
-    """What the lines of a file hold, as JSON; nothing where there is no file. A last line that a kill has cut
-    short is taken off, so that the next one can be added.
+def finished(file: Path, make: Callable[[Any], T]) -> list[T]:
+    """As `whole_lines`; nothing where there is no file. A last line that a kill has cut short is taken off,
+    so that the next one can be added.
     """
     if not file.exists():
         return []
     os.truncate(file, file.read_bytes().rfind(b"\n") + 1)
-    with open(file) as lines:
-        return [json.loads(line) for line in lines]
+    return whole_lines(file, make)
+
+
+def whole_lines(file: Path, make: Callable[[Any], T]) -> list[T]:
+    """What `make` makes of the JSON of each line; a last line that was cut short does not count. Raises
+    InputError for a line that is damaged, or was written by a version whose records had other fields.
+    """
+    lines, found = file.read_bytes().split(b"\n")[:-1], list[T]()
+    try:
+        for line in lines:
+            found.append(make(json.loads(line)))
+    except (ValueError, TypeError, KeyError):
+        number = len(found) + 1
+        raise InputError(
+            f"line {number} of {file} is not a run of this version", path="out",
+            got=repr(lines[len(found)][:40]),
+            expected="another --out; or delete that line, and its run is made again",
+        ) from None  # fmt: skip
+    return found
+
+
+def add_lines(file: Path, values: Sequence[Any]) -> None:
+    """Adds a line of JSON for each value, all in one write: the lines of two processes never mix."""
+    with open(file, "ab") as lines:
+        lines.write("".join(json.dumps(value) + "\n" for value in values).encode())
 
 
 def check(folder: Path, experiment: Experiment) -> None:
     """Raises InputError where new records would not be comparable with those that the folder holds."""
     if not (folder / ABOUT).exists():
+        if (folder / RUNS).exists():
+            raise InputError(
+                f"{folder} has runs, and no {ABOUT} that says of which experiment", path="out",
+                got=str(folder), expected="another folder",
+            )  # fmt: skip
         return
     found, made_from = read_about(folder)
     if found != experiment:
@@ -150,22 +178,16 @@ def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
     """The experiment of a folder, and what its records were made from; None if the folder does not say it."""
     try:
         content = json.loads((folder / ABOUT).read_text())
-    except ValueError:
+        made_from = content.pop("made_from", None)
+        return Experiment.from_json(content), made_from
+    except (ValueError, TypeError, AttributeError):
         raise InputError(
             f"{folder / ABOUT} is no description of an experiment", path="out", got=str(folder),
             expected="a folder that `specshield evaluate --out` has written",
         ) from None  # fmt: skip
-    made_from = content.pop("made_from", None)
-    return Experiment.from_json(content), made_from
 
 
 def read(folder: Path) -> list[Record]:
     """The records that a folder holds: the last for each run and method, no line that was cut off."""
-    with open(folder / "runs.jsonl") as lines:
-        records = [Record.from_json(json.loads(line)) for line in lines if line.endswith("\n")]
+    records = whole_lines(folder / RUNS, Record.from_json)
     return list({(record.run, record.method): record for record in records}.values())
-
-
-def _keep(folder: Path, records: Sequence[Record]) -> None:
-    with open(folder / "runs.jsonl", "a") as lines:
-        lines.writelines(json.dumps(record.to_json()) + "\n" for record in records)

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from evaluation.evaluation import finished
+from evaluation.evaluation import add_lines, finished
 from evaluation.experiment import Experiment
 from evaluation.methods import Shielded
 from evaluation.results import markdown
@@ -80,12 +80,11 @@ class Training:
     def records(self, out: Path, runs: int) -> list[Record]:
         """Runs 0 to `runs` - 1 by the paper's decision rule with the network; what `out` holds is kept."""
         file = self.folder(out) / "runs.jsonl"
-        done = [Record.from_json(each) for each in finished(file)]
+        done = finished(file, Record.from_json)
         setting, method = Experiment(self.case).setting, Shielded(self.shield(out), carries=False)
         for i in range(len(done), runs):
             done += run_by(setting, i, {"paper": method}, [_keeping(self.case)])
-            with open(file, "a") as kept:
-                kept.write(json.dumps(done[-1].to_json()) + "\n")
+            add_lines(file, [done[-1].to_json()])
         return done[:runs]
 
 

@@ -45,13 +45,16 @@ def measure(
 
     cases: names of cases, or of houses that are drawn.
     """
-    found: dict[tuple[str, str], list[Record]] = {}
+    asked: dict[tuple[str, str], Experiment] = {}
     for model in models:
         for case in cases:
             house = case if DRAWN.fullmatch(case) else None
-            experiment = Experiment("house" if house else case, house, model, seed=seed)
-            folder = out / model / case / experiment.noise
-            found[model, case] = evaluate(experiment, runs, METHODS, folder, processes)
+            asked[model, case] = Experiment("house" if house else case, house, model, seed=seed)
+            _ = asked[model, case].setting  # refused now where there is none, and not after hours of runs
+    found: dict[tuple[str, str], list[Record]] = {}
+    for (model, case), experiment in asked.items():
+        folder = out / model / case / experiment.noise
+        found[model, case] = evaluate(experiment, runs, METHODS, folder, processes)
     command = f"python -m evaluation rivals --runs {runs} --seed {seed} --case {','.join(cases)}"
     if tuple(models) != FAMILIES:
         command += f" --model {','.join(models)}"

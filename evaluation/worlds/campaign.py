@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.evaluation import finished, workers
+from evaluation.evaluation import add_lines, finished, workers
 from evaluation.statistics import clopper_pearson
 from evaluation.worlds.runs import Outcome, Trial, run
 from specshield.sim.campaign import each_done
@@ -31,14 +30,13 @@ def compare(trials: Sequence[Trial], runs: int, out: Path | None, processes: int
 def outcomes(trial: Trial, runs: int, out: Path | None, processes: int) -> list[Outcome]:
     """Runs 0 to `runs` - 1 of a trial, those that were kept before among them."""
     file = None if out is None else out / f"{'-'.join(_parts(trial))}.jsonl"
-    kept = [] if file is None else [Outcome(**each) for each in finished(file)]
+    kept = [] if file is None else finished(file, lambda kept: Outcome(**kept))
     done = {outcome.run: outcome for outcome in kept}
     for outcome in _made(trial, [i for i in range(runs) if i not in done], processes):
         done[outcome.run] = outcome
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-            with open(file, "a") as lines:
-                lines.write(json.dumps(outcome.to_json()) + "\n")
+            add_lines(file, [outcome.to_json()])
     return [done[i] for i in range(runs)]
 
 

@@ -49,6 +49,26 @@ def test_without_mujoco_it_is_said_how_to_get_it():
     assert "pip install -e './evaluation[mujoco]'" in line
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("rewards --seeds 0,1.7", "--seeds: not all are whole numbers"),
+        ("rewards --seeds 0,-1", "--seeds: not all are whole numbers"),
+        ("rewards --seeds nan", "--seeds: not all are whole numbers"),
+        ("rewards --case 1,9", "there is no case 'case9'"),
+        ("curves --case 1,9", "there is no case 'case9'"),
+        ("rivals --case case1,case9", "there is no case 'case9'"),
+        ("rivals --model learned,nobody", "there is no model 'nobody'"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_the_rest_is_run(tmp_path, words, told):
+    name, option, value = words.split()
+    out = tmp_path / "out"
+    refused = specshield(name, option, value, "--out", str(out), "--page", str(tmp_path / "page.md"), code=1)
+    assert told in refused.stderr
+    assert not out.exists()
+
+
 def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):
     arguments = ["evaluate", "--case", "1", "--runs", "2", "--methods", "unmodified,ours"]
     arguments += ["--processes", "1", "--out", str(tmp_path)]

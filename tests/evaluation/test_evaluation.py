@@ -111,10 +111,31 @@ def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
     assert [path.name for path in tmp_path.rglob("*.json*")] == ["experiment.json"]
 
 
-def test_a_folder_whose_description_is_broken_is_told_in_a_line(tmp_path):
+@pytest.mark.parametrize("damage", [b"x", b"[]", b'{"run": 0}', b"\xff", b"\x00"])
+def test_a_damaged_run_is_told_by_its_line_and_made_again_once_that_is_deleted(serial, tmp_path, damage):
+    evaluate(EXPERIMENT, 1, METHODS, tmp_path)
+    path = tmp_path / "runs.jsonl"
+    whole = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(damage + b"\n" + whole[1])
+    for reading in (lambda: evaluate(EXPERIMENT, 1, METHODS, tmp_path), lambda: read(tmp_path)):
+        with pytest.raises(InputError, match=r"^out: line 1 of .*runs\.jsonl is not a run of this version"):
+            reading()
+    path.write_bytes(whole[1])
+    assert same(evaluate(EXPERIMENT, 1, METHODS, tmp_path)) == same(serial[:2])
+
+
+def test_runs_of_which_nothing_says_the_experiment_are_not_taken_for_this_one(tmp_path):
+    evaluate(EXPERIMENT, 1, METHODS[:1], tmp_path)
+    (tmp_path / "experiment.json").unlink()
+    with pytest.raises(InputError, match=r"has runs, and no experiment\.json"):
+        evaluate(Experiment("case1", seed=6), 1, METHODS[:1], tmp_path)
+
+
+@pytest.mark.parametrize("description", ['{"case": "ca', "[]", "{}", '{"case": "case1", "sead": 0}'])
+def test_a_folder_whose_description_is_broken_is_told_in_a_line(tmp_path, description):
     kept = tmp_path / "case1" / "none"
     kept.mkdir(parents=True)
-    (kept / "experiment.json").write_text('{"case": "ca')
+    (kept / "experiment.json").write_text(description)
     with pytest.raises(InputError, match=r"experiment\.json is no description of an experiment"):
         campaigns.evaluate([Experiment("case1")], 1, ["ours"], tmp_path, 1, None, False)
 

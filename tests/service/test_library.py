@@ -332,7 +332,11 @@ def test_what_owners_share_leaves_the_sum_as_it_came(library, claims):
     map_id = maps.add(OccupancyGrid(cells(), RESOLUTION), {}, ANN).id
     maps.add(OccupancyGrid(cells(), RESOLUTION), {}, BEN)
     record = policies.add(asked(policies, map_id), ANN)
+    checkpoint = policies.checkpoints(record.id) / "state.safetensors"
+    checkpoint.parent.mkdir()
+    checkpoint.write_bytes(bytes(50_000))
     policies.finish(record.id, bytes(9000), {})
+    assert not checkpoint.parent.exists(), "nobody is charged for it, and nothing goes on from it any more"
     policies.add(record, BEN)
     assert sums(claims)[b"o:ben"] == sums(claims)[b"o:ann"], "both are charged what it takes"
     with claims.adding("policies", "2" * 64, ANN, 10), claims.adding("policies", "2" * 64, BEN, 3):

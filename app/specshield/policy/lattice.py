@@ -38,9 +38,11 @@ from specshield.world.regions import PackedRegions, turns_with_robot
 STEP_CODES = 64.0  # codes of a step in a table of steps
 INVALID = 65535  # the code of a pose that is in collision or breaks what the table keeps
 NO_TIME = -1.0  # in place of a step, where there is none
+Pose = tuple[float, float, float]
 SMALL = 1_000_000  # poses of a lattice that one thread makes
 THREADS = 2  # that make a larger one: kernels let go of the interpreter's lock
-SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere (chosen by hand)
+# [m] A move that contact cuts shorter than this leads nowhere, or below half of a stride that is shorter.
+SHORTEST_MOVE = 0.02  # chosen by hand
 MAX_HEADINGS = 120
 FEWEST_HEADINGS, USUAL_HEADINGS = 24, 72  # where none fits every turn exactly: 15 to 5 degrees each
 # [headings] How far a turn may be off a multiple of a heading to count as exact, and as nearly exact: ten
@@ -214,6 +216,13 @@ def bilinear(valid: Bytes, table: Singles, v: float, u: float, h: int) -> float:
         total += w * table[j, i, h]
         weights += w
     return total / weights if weights > 1e-6 else NO_TIME
+
+
+@inlined
+def leads_on(body: Body, motion: int, x: float, y: float, theta: float, to: Pose) -> bool:
+    """Whether a motion from a pose, which has led to `to`, leads anywhere."""
+    far, _ = displacement(body, motion)
+    return bool(abs(to[0] - x) + abs(to[1] - y) > min(SHORTEST_MOVE, 0.5 * abs(far)) or to[2] != theta)
 
 
 @inlined

@@ -85,12 +85,26 @@ def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path, monkeypat
     assert policy.card["metrics"]["wall_time_s"] >= 0
 
 
-def test_another_tasks_checkpoint_is_ignored(tmp_path):
+def test_another_trainings_checkpoint_is_ignored_and_a_damaged_one(tmp_path):
     train(TASK, TINY, Run(checkpoints=tmp_path))
-    for task, settings in ((flat("F[0,31] West"), TINY), (TASK, replace(TINY, discount=0.9))):
-        training = Training(task, settings, 0)
-        training.resume(tmp_path)
-        assert training.update == 0
+    for task, settings, seed in (
+        (flat("F[0,31] West"), TINY, 0),
+        (TASK, replace(TINY, discount=0.9), 0),
+        (TASK, TINY, 1),
+    ):
+        other = Training(task, settings, seed)
+        other.resume(tmp_path)
+        assert other.update == 0
+    kept = tmp_path / "state.safetensors"
+    for damaged in (b"", bytes(500), kept.read_bytes()[:-1]):
+        kept.write_bytes(damaged)
+        again = Training(TASK, TINY, 0)
+        again.resume(tmp_path)
+        assert again.update == 0
+
+
+def test_robots_that_never_explore_can_learn():
+    assert Training(TASK, replace(TINY, exploration=(0.0, 0.0)), 0).epsilon.max() < 1e-5
 
 
 def test_nothing_is_trained_outside_the_fragment():

@@ -1,10 +1,19 @@
 """Going down a field by hand: a corridor, one to wait in, one step of a beam."""
 
+import math
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
+from specshield.episode import make_shield, start
+from specshield.errors import InfeasibleStart
 from specshield.policy.planner.approach import _insert, descend, descend_by_beam
+from specshield.policy.planner.policy import synthesise
 from specshield.policy.planner.way import BEGIN, UNTIL, keeps, stay
+from specshield.robot import robot_from_json
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT
 from tests.policy.planner.worlds import cells_of, literal_of, nothing_needed, plan_from
 
@@ -38,6 +47,21 @@ def test_a_descent_that_may_wait_waits_for_what_has_to_hold():
     assert descend(world, way, k, world.field[k, 0], True, 0, 14, need) == 6
     assert way.motions[:6].tolist() == [FORWARD, WAIT, WAIT, FORWARD, FORWARD, FORWARD]
     assert descend(world, way, k, world.field[k, 0], True, 0, 5, need) == -1  # too late
+
+
+@pytest.mark.parametrize("stride", [0.02, 0.01, 0.002])
+def test_a_robot_with_small_strides_gets_there(stride):
+    """Straight on, to the last step that its strides take; one step less is too late."""
+    strides = round(0.3 / stride)
+    robot = robot_from_json(
+        {"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": stride}, {"name": "wait"}]}
+    )
+    for steps, kept in ((strides + 1, True), (strides, False)):
+        grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
+        task = make_task(grid, robot, f"F[0,{steps}] y > {0.5 + (strides + 0.5) * stride}")
+        shield = make_shield([synthesise(task)])
+        with nullcontext() if kept else pytest.raises(InfeasibleStart):
+            start(shield, (1.0, 0.5, math.pi / 2))
 
 
 def test_what_has_to_hold_is_asked_for_in_its_steps_alone(corridor):

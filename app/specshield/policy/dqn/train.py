@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from scipy.special import betaincinv  # scipy.stats has the interval, and takes 0.5 s more to import
 from torch import nn
@@ -140,7 +140,7 @@ class Training:
     """The robots, the networks, and how far it is."""
 
     def __init__(self, task: Task, settings: Settings, seed: int) -> None:
-        self.task, self.settings = task, settings
+        self.task, self.settings, self.seed = task, settings, seed
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.environment = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
         self.inputs, self.outputs = self.environment.robots.observation.shape[1], len(task.robot.motions)
@@ -154,8 +154,8 @@ class Training:
         for other in (self.target_network, self.best):
             other.load_state_dict(self.q_network.state_dict())
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), lr=settings.learning_rate)
-        low, high = sorted(settings.exploration)
-        self.epsilon = np.geomspace(high, max(low, 1e-6), settings.robots)  # each robot has its own
+        low, high = np.maximum(sorted(settings.exploration), 1e-6)
+        self.epsilon = np.geomspace(high, low, settings.robots)  # each robot has its own
         steps = max(settings.replay // settings.robots, 4 * settings.returns)
         self.replay = Replay(steps, settings.robots, self.inputs)
         self.update = 0
@@ -214,6 +214,12 @@ class Training:
     def _networks(self) -> dict[str, nn.Module]:
         return {"q": self.q_network, "target": self.target_network, "best": self.best}
 
+    @property
+    def _of(self) -> dict[str, Any]:
+        """What a checkpoint is of, as JSON."""
+        settings = options_to_json(self.settings)
+        return {"task": self.task.content_hash, "settings": settings, "seed": self.seed}
+
     def save(self, folder: Path) -> None:
         """Writes the checkpoint at once: a kill meanwhile leaves the one before."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -221,8 +227,7 @@ class Training:
         parts |= {f"adam{i}": state for i, state in self.optimizer.state_dict()["state"].items()}
         tensors = {f"{part} {name}": tensor for part in parts for name, tensor in parts[part].items()}
         meta = {
-            "task": self.task.content_hash,
-            "settings": options_to_json(self.settings),
+            **self._of,
             "update": self.update,
             "elapsed": time.monotonic() - self.began,
             "latest": self.latest,
@@ -233,18 +238,23 @@ class Training:
         os.replace(folder / "state.tmp", folder / "state.safetensors")
 
     def resume(self, folder: Path) -> None:
-        """Goes on from a checkpoint of the same task and settings; any other is ignored."""
+        """Goes on from a checkpoint of the same task, settings and seed; any other is ignored, and so is one
+        that a loss of power has damaged.
+        """
         path = folder / "state.safetensors"
         if not path.exists():
             return
         parts: dict[str, dict[str, torch.Tensor]] = {}
-        with safe_open(path, framework="pt") as opened:
-            meta = json.loads(opened.metadata()["meta"])
-            if (meta["task"], meta["settings"]) != (self.task.content_hash, options_to_json(self.settings)):
-                return
-            for key in opened.keys():  # noqa: SIM118 (not a dict)
-                part, name = key.split()
-                parts.setdefault(part, {})[name] = opened.get_tensor(key)
+        try:
+            with safe_open(path, framework="pt") as opened:
+                meta = json.loads(opened.metadata()["meta"])
+                if {name: meta.get(name) for name in self._of} != self._of:
+                    return
+                for key in opened.keys():  # noqa: SIM118 (not a dict)
+                    part, name = key.split()
+                    parts.setdefault(part, {})[name] = opened.get_tensor(key)
+        except SafetensorError:
+            return
         for part, network in self._networks.items():
             network.load_state_dict(parts[part])
         moments = {int(part[4:]): parts[part] for part in parts if part.startswith("adam")}

@@ -9,7 +9,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, leaf
-from specshield.policy.lattice import SHORTEST_MOVE, leads_back
+from specshield.policy.lattice import leads_back, leads_on
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
@@ -65,7 +65,7 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
             if padding and not barred:
                 break
             nx, ny, nth = lead(world, x, y, theta, m)
-            led = abs(nx - x) + abs(ny - y) > SHORTEST_MOVE or nth != theta
+            led = leads_on(body, m, x, y, theta, (nx, ny, nth))
             if led or padding:
                 read_pose(world.literals, nx, ny, nth, way.values, way.stack, way.rho)
                 if keeps(world, k, way.t + n + 1, need, way.rho):
@@ -115,7 +115,7 @@ def descend_by_beam(
                 if leads_back(body, last, m) or (m == world.pad and world.stands):
                     continue
                 x, y, theta = lead(world, before[0], before[1], before[2], m)
-                led = abs(x - before[0]) + abs(y - before[1]) > SHORTEST_MOVE or theta != before[2]
+                led = leads_on(body, m, before[0], before[1], before[2], (x, y, theta))
                 if shortest == 0 and not led:
                     continue
                 ahead = to_go_at(body, world.fields, f, x, y, theta)

@@ -11,7 +11,7 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import inlined, leaf
-from specshield.policy.lattice import SHORTEST_MOVE
+from specshield.policy.lattice import leads_on
 from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.guide import copy_progress, fill, is_over, predicate_at, read_due
 from specshield.policy.reachability.tables import (
@@ -87,7 +87,7 @@ def climb(
             if scores[best] <= HOPELESS:
                 break
             nx, ny, nth = step(body, x, y, theta, best)
-            leads = abs(nx - x) + abs(ny - y) > SHORTEST_MOVE or nth != theta
+            leads = leads_on(body, best, x, y, theta, (nx, ny, nth))
             leads = leads and not is_barred(guide.barred, x, y, theta, best)
             if leads and _keeps(rules, t + n + 1, nx, ny, nth, scratch):
                 chosen = best

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
@@ -224,6 +225,7 @@ class Policies(Claimed):
         if self._kept.find(id, "policy.json") is None:
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
         self._kept.write(id, {WEIGHTS: weights, "card.json": files.to_json({**card, "id": id})})
+        shutil.rmtree(self.checkpoints(id), ignore_errors=True)  # five times the weights, and not weighed
         if self.given is not None:
             self.claims.weigh("policies", id, self._kept.weight(id))
 
