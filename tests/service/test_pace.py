@@ -9,7 +9,7 @@ from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State
-from specshield.service.sessions.steps import LONG, SEVERAL, SHORT, WATCHED, Pace, decided, learns
+from specshield.service.sessions.steps import LONG, SEVERAL, SHORT, WATCHED, Pace, alike, decided, learns
 from specshield.service.settings import Settings
 from specshield.shield.decision import Config
 from specshield.shield.uncertainty import Uncertainty
@@ -99,3 +99,16 @@ def test_a_step_that_may_change_the_map_is_seen_before_it_is_decided(tmp_path):
     assert after.map_revision > 0
     later = session._replace(state=replace(session.state, carry=after.carry))
     assert learns(shields, later, asked(2, half))
+
+
+def test_how_long_some_decisions_take_says_nothing_of_those_of_other_kinds():
+    step, mine = StepBody(0, [[0.0, 0.0, 0.0]]), rule(policy_ids=["p"], owner="me")
+    kinds = [
+        alike(mine, step),
+        alike(mine, StepBody(0, [[0.0, 0.0, 0.0]], explain=True)),
+        alike(rule(policy_ids=["p"], owner="you"), step),
+        alike(rule(policy_ids=["p", "q"], owner="me"), step),
+        alike(rule(policy_ids=["p"], owner="me", shaping="lookahead"), step),
+    ]
+    assert len(set(kinds)) == len(kinds)
+    assert alike(mine, StepBody(9, [[1.0, 2.0, 0.0]])) == kinds[0]

@@ -24,6 +24,7 @@ from specshield.service.schemas.answers import StepAnswer
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import RACES, Session, asked_of, contended, decide, missing
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State
@@ -170,9 +171,8 @@ class Steps:
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
-        rule, ids = session.rule, tuple(session.rule.policy_ids)
-        # By owner, since another owner's robots may be on the map as it is, where decisions are short.
-        pace = self._paces.get((rule.owner, rule.shaping, *ids), Pace)
+        ids = tuple(session.rule.policy_ids)
+        pace = self._paces.get(alike(session.rule, request), Pace)
         if self._shields.slow(session, pace.long):
             asked = timed, session, request
             made, seconds, _ = await self._heavy.decide(*asked, session=session.id, key=ids)
@@ -193,6 +193,14 @@ class Steps:
         if not learned:  # the time on a changed map says nothing about other sessions with these policies
             pace.add(seconds, cpu)
         return made
+
+
+def alike(rule: Rule, request: StepBody) -> tuple[str | bool, ...]:
+    """What decisions have in common of which one tells how long another takes. The owner, since another
+    owner's robots may be on the map as it is, where decisions are short. Whether it is explained, since an
+    explanation may take a hundred times as long as the decision.
+    """
+    return rule.owner, rule.shaping, request.explain, *rule.policy_ids
 
 
 def learns(shields: Shields, session: Session, request: StepBody) -> bool:
