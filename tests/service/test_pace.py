@@ -1,16 +1,33 @@
 """Where a decision is made: on the event loop, on it with the processor's time measured, or in a thread."""
 
+import asyncio
+import threading
+from collections import defaultdict
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from specshield.service.heavy.heavy import Heavy
+from specshield.service.heavy.threads import Threads
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State
-from specshield.service.sessions.steps import LONG, SEVERAL, SHORT, WATCHED, Pace, alike, decided, learns
+from specshield.service.sessions.steps import (
+    LONG,
+    SEVERAL,
+    SHORT,
+    WATCHED,
+    Pace,
+    Steps,
+    alike,
+    decided,
+    learns,
+)
 from specshield.service.settings import Settings
+from specshield.service.storage.store import Store
 from specshield.shield.decision import Config
 from specshield.shield.uncertainty import Uncertainty
 from tests.service.world import rule
@@ -112,3 +129,26 @@ def test_how_long_some_decisions_take_says_nothing_of_those_of_other_kinds():
     ]
     assert len(set(kinds)) == len(kinds)
     assert alike(mine, StepBody(9, [[1.0, 2.0, 0.0]])) == kinds[0]
+
+
+def test_policies_that_this_process_has_not_read_are_read_in_a_thread(tmp_path):
+    """Those of a large floor take so long that other robots would wait."""
+    settings, read_in = Settings(data_dir=tmp_path), set()
+
+    class Noting(Shields):
+        def of(self, session):
+            read_in.add(threading.current_thread())
+            return super().of(session)
+
+    shields = Noting(policies_of(settings))
+    case = [rule(policy_ids=[shields.policies.find("case1", "").id])]
+    state = State(1, 0, True, "pending", 0.0, b"")
+    session = Session(case, Config(max_steps=600), state, b"", np.array([[4.5, 5.0, 0.0]]), [], 0, 0)
+
+    async def decide():
+        store = Store("redis://127.0.0.1:1", 1.0, 60)  # is not asked here
+        steps = Steps(store, shields, Threads(), Heavy(settings), 60, lambda *_: None)
+        return await steps._decide(session, StepBody(0, [[4.5, 5.0, 0.0]], [0.0] * 20), defaultdict(float))
+
+    assert asyncio.run(decide()).decision.t == 0
+    assert threading.main_thread() not in read_in

@@ -41,7 +41,7 @@ NO_TIME = -1.0  # in place of a step, where there is none
 Pose = tuple[float, float, float]
 SMALL = 1_000_000  # poses of a lattice that one thread makes
 THREADS = 2  # that make a larger one: kernels let go of the interpreter's lock
-# [m] A move that contact cuts shorter than this leads nowhere, or below half of a stride that is shorter.
+# [m] A move that contact cuts shorter than this, or than half of its stride if that is less, leads nowhere.
 SHORTEST_MOVE = 0.02  # chosen by hand
 MAX_HEADINGS = 120
 FEWEST_HEADINGS, USUAL_HEADINGS = 24, 72  # where none fits every turn exactly: 15 to 5 degrees each

@@ -91,7 +91,7 @@ def on_keys(
                     await store.follow()
             except StoreError as error:
                 told = f"the keys are changed, but a failover may undo that: {error.message}"
-                raise error.retold(told) from error
+                raise error.retold(told) from error.__cause__
             return result
 
     with ExitStack() as opened:

@@ -17,8 +17,8 @@ OWNERS = 64  # whose threads are kept. The threads of others end after what they
 
 class Threads(ThreadPoolExecutor):
     """Each owner has threads of its own, so that no request waits for work that another owner has asked for.
-    Whose work it is says the request that is being answered; the threads of callers without a key are those
-    of this executor itself.
+    The owner is that of the request that is being answered. Callers without a key share the threads of this
+    executor itself.
     """
 
     def __init__(self) -> None:

@@ -179,8 +179,9 @@ class Steps:
             timing["rollout"] += seconds
             return made
         cpu: float | None = None
-        # A step may take long once the map is no longer the one that the policies were made for.
-        if (learned := learns(self._shields, session, request)) or not pace.short:
+        # A step may take long once the map is no longer the one that the policies were made for. The first
+        # ones may have to read the policies, so `learns`, which needs them too, is not asked before these.
+        if not pace.short or learns(self._shields, session, request):
             run = asyncio.get_running_loop().run_in_executor
             made, seconds, cpu = await run(self._threads, timed, self._shields, session, request)
         elif pace.doubted:
@@ -190,7 +191,8 @@ class Steps:
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
         timing["rollout"] += seconds
-        if not learned:  # the time on a changed map says nothing about other sessions with these policies
+        # The time on a changed map says nothing about other sessions with these policies.
+        if not (request.occupied or request.free or made.decision.map_revision):
             pace.add(seconds, cpu)
         return made
 
