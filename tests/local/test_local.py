@@ -96,6 +96,8 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
         ]
         assert local.trajectory(after=78) == local.trajectory()[79:]
         assert [each.t for each in remote.trajectory(after=78)] == [each.t for each in local.trajectory(78)]
+        with pytest.raises(InputError, match=r"^after.* got 'x'"):
+            remote.trajectory(after="x")
 
 
 def test_a_server_switches_the_same(server: RunningServer) -> None:

@@ -220,7 +220,7 @@ class SessionState:
         """Reads the certified continuation from the stored answers, after the robot's process began anew."""
         if self.on_failure != "witness" or self.finished:
             return
-        for item in (yield from self._trajectory(self.t - 1 - RECALLED)) if self.t else ():
+        for item in (yield from self._trajectory(max(self.t - 1 - RECALLED, -1))) if self.t else ():
             self._continuation.branches = ()
             if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
                 decision = decision_of(item.decision, vars(self.info), self.info.main_task_done, {})
@@ -291,8 +291,8 @@ class SessionState:
 
     def _trajectory(self, after: int = -1) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states that the server has after step `after`, with its answers."""
-        asked = {"after": str(max(after, -1))}
-        body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True, params=asked))
+        asked = wire.get("sessions", self.id, "trajectory", slow=True, params={"after": str(after)})
+        body = yield from call(asked)
         return tuple(build(TrajectoryItem, item) for item in build(Page, body).items)
 
     def _learned(self) -> Flow[Learned]:

@@ -118,7 +118,8 @@ class StepResponse(BaseModel):
         description="pi_FM(S_t): the probability that the model itself gives to S_t, if it does not end."
     )
     kl: float | None = Field(
-        description="KL(pi* || pi_FM) [nats]; null if the model excludes an action that pi* does not."
+        description="KL(pi* || pi_FM) [nats]; null without logits, and if the model excludes an action that "
+        "pi* does not."
     )
     reason: str | None = Field(
         description="Why the mode is `fallback` (`infeasible`, `zero_prior_mass`); or `margin_unattainable`: "
