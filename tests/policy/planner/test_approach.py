@@ -12,6 +12,7 @@ from specshield.policy.planner.approach import _insert, descend, descend_by_beam
 from specshield.policy.planner.policy import synthesise
 from specshield.policy.planner.way import BEGIN, UNTIL, keeps, stay
 from specshield.robot import robot_from_json
+from specshield.robot.dynamics import make_body, simulate
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT
@@ -62,6 +63,23 @@ def test_a_robot_with_small_strides_gets_there(stride):
         shield = make_shield([synthesise(task)])
         with nullcontext() if kept else pytest.raises(InfeasibleStart):
             start(shield, (1.0, 0.5, math.pi / 2))
+
+
+@pytest.mark.parametrize("heading", [-math.pi / 2, 0.0, math.pi / 2])
+def test_a_robot_whose_strides_skip_every_other_cell_gets_there(heading):
+    """It turns by 90 degrees alone, and stands between the cells from which a way leads and those from which
+    none does.
+    """
+    turns = [{"name": "left", "rotate": math.pi / 2}, {"name": "right", "rotate": -math.pi / 2}]
+    actions = [{"name": "go", "translate": 0.2}, *turns, {"name": "wait"}]
+    robot = robot_from_json({"footprint": {"radius": 0.09}, "actions": actions})
+    goal = {"A": {"type": "circle", "center": [0.3, 0.1], "radius": 0.09}}
+    task = make_task(OccupancyGrid(np.zeros((4, 4), bool), 0.2), robot, "F[0,10] A", goal)
+    plan = synthesise(task).propose(np.array([[0.3, 0.5, heading]]), {}, 0.0)
+    (way,) = plan.motions[plan.motions[:, 0] == plan.preferred]
+    poses = np.empty((len(way), 3))
+    simulate(make_body(robot, task.grid), np.array([0.3, 0.5, heading]), way, poses)
+    assert np.hypot(poses[:, 0] - 0.3, poses[:, 1] - 0.1).min() < 0.09
 
 
 def test_what_has_to_hold_is_asked_for_in_its_steps_alone(corridor):

@@ -76,26 +76,31 @@ def steps_to(lattice: Lattice, goal: Bools, keeps: Bools) -> Codes:
 
 @leaf
 def to_go(fields: Fields, f: int, v: float, u: float, h: float) -> float:
-    """Steps to go at lattice coordinates: linear in x, y and heading over the corners that are valid; inf
-    where none is.
+    """Steps to go at lattice coordinates: linear in x, y and heading over the corners from which a way leads;
+    OUT_OF_REACH where no way leads from any valid corner, inf where no corner is valid.
+
+    A corner without a way does not count beside one that has a way. Where strides are a multiple of the
+    pitch and turns are square, no way leads from some of the cells to others, and a robot between two such
+    cells can still go as from the better one.
     """
     (ny, nx), code = fields.cell.shape, fields.code[f]
     low, high, share = beside(h, code.shape[1])
-    total, weights = 0.0, 0.0
+    total, weights, valid = 0.0, 0.0, 0.0
     for n in range(4):
         j, i, across = corner(v, u, n)
         if j < 0 or j >= ny or i < 0 or i >= nx or across == 0.0 or fields.cell[j, i] < 0:
             continue
-        row = fields.cell[j, i]
-        w, found = across * (1.0 - share), code[row, low]
-        if w >= 1e-9 and found != INVALID:
-            total += w * min(int(found), MOST)
-            weights += w
-        w, found = across * share, code[row, high]
-        if w >= 1e-9 and found != INVALID:
-            total += w * min(int(found), MOST)
-            weights += w
-    return total / (STEP_CODES * weights) if weights > 1e-6 else np.inf
+        for heading, part in ((low, 1.0 - share), (high, share)):
+            w, found = across * part, code[fields.cell[j, i], heading]
+            if w < 1e-9 or found == INVALID:
+                continue
+            valid += w
+            if found < MOST:
+                total += w * int(found)
+                weights += w
+    if weights > 1e-6:
+        return total / (STEP_CODES * weights)
+    return OUT_OF_REACH if valid > 1e-6 else np.inf
 
 
 @leaf
