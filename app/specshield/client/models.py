@@ -184,7 +184,7 @@ class Decision:
     in_collision: bool  # x_t touches an obstacle
     next_poses: tuple[Pose, ...]
     residual: Residual | None
-    witness: tuple[int, ...] | None  # the actions that follow the one to run, to the horizon
+    witness: tuple[int, ...] | None  # the actions that follow `execute`, to the horizon
     execute: int
     timings: Mapping[str, float]  # [ms], from the Server-Timing header
     witnesses: tuple[tuple[int, ...] | None, ...] | None = None

@@ -57,7 +57,8 @@ order: check a formula, send a map, begin a session, decide a step, close, read 
 
 x_t is the pose at step t, T the rule's last step (its horizon), and f the model of the robot's motions. J of
 an action is 1 if a future that begins with it keeps the rule, and S_t has the actions with J = 1. pi_FM is
-the model's distribution, pi* the answer's, and rho the robustness [m], by which a trajectory keeps the rule.
+the model's distribution, and pi* that of the answer. rho, the robustness [m], says by how much a trajectory
+keeps the rule.
 """
 
 

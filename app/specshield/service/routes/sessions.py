@@ -188,7 +188,9 @@ async def trajectory(
     ] = None,
     after: Annotated[int, Query(ge=-1, le=1_000_000, description="Leave out the steps up to this one.")] = -1,
 ) -> Response:
-    """The states x_0 to x_t with the answers, as one JSON object or as one JSON object in each line."""
+    """The states x_0 to x_t with the answers, as one JSON object or as one JSON object in each line. With
+    `after`, only those of later steps.
+    """
     lines, rules = await server.sessions.trajectory(key, after)
     if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
         return StreamingResponse(_each(lines, server.reading), media_type=NDJSON)
