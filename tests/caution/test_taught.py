@@ -294,6 +294,29 @@ def test_a_motion_that_leads_nowhere_is_not_tried_for_ever(over, noise):
     assert int(STRETCH.motion_of[left]) in [motion for *_, motion in carry.stuck]
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_a_wall_4_cm_nearer_than_told_is_not_pushed_for_ever(noise):
+    """f leads on to the wall that it knows, by less than noise can be. The robot does not move at all."""
+    random, walls = np.random.default_rng(1), np.zeros((2, 100, 150), bool)
+    walls[0, :, 125:], walls[1, :, 123:] = True, True  # as told, as it is
+    grids = [OccupancyGrid(each, 0.02) for each in walls]
+    task = make_task(grids[0], STRETCH, "F[0,60] x < 0.6")
+    shield = make_shield([synthesise(task)], Config(learn_map=True, uncertainty=Uncertainty()))
+    logits = np.where(np.arange(len(STRETCH.actions)) == AHEAD, 3.0, -8.0)
+    real, poses, carry, drawn = make_body(STRETCH, grids[1]), [(1.9, 1.0, 0.0)], None, []
+    for _ in range(20):
+        decision = decide(shield, poses, logits, carry=carry)
+        carry = decision.carry
+        drawn.append(decision.action)
+        ended = step(real, *poses[-1], int(STRETCH.motion_of[decision.action]))
+        noisy = tuple((np.array(ended) + random.normal(0.0, noise, 3)).tolist())
+        poses.append(ended if in_collision(real, *noisy) else noisy)
+    assert drawn[:3] == [AHEAD] * 3
+    assert BACK in drawn
+    assert drawn.count(AHEAD) < 12
+    assert decision.map_revision > 0
+
+
 @pytest.mark.parametrize(
     ("formula", "stays"), [("F[0,64] Goal", 35), ("F[0,64] Goal and F[64,110] Home", 40)]
 )

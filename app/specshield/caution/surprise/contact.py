@@ -65,9 +65,16 @@ def contact_of(
     did nothing at this pose before.
     """
     drawn = followed.drawn
-    if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
+    stands = is_near(before[None], after, near)
+    # Just before a wall of the map, f may foresee less of a motion than noise can be. If the robot does not
+    # move there at all, something else stopped it, and it could push that until its time is up.
+    if (
+        drawn >= 0
+        and is_near(foreseen[drawn : drawn + 1], after, near)
+        and not (stands and _nearer(before, foreseen[drawn], after))
+    ):
         return -1, moved_on(followed, as_drawn=True)
-    if is_near(before[None], after, near):  # it stands where it stood
+    if stands:
         followed = followed._replace(by_chance=followed.by_chance * followed.standing)
         if drawn < 0 or not followed.surely:
             return -1, followed._replace(halted=-1)
@@ -99,6 +106,11 @@ def is_near(poses: Floats, pose: Floats, near: Near) -> bool:
         if far <= near[0] and abs(wrap(poses[i, 2] - pose[2])) <= near[1]:
             return True
     return False
+
+
+def _nearer(one: Floats, other: Floats, pose: Floats) -> bool:
+    """Whether a pose (3,) lies less than half as far from `one` (3,) as from `other` (3,)."""
+    return bool(np.hypot(*(pose - one)[:2]) < 0.5 * np.hypot(*(pose - other)[:2]))
 
 
 def _short(body: Body, before: Floats, after: Floats, foreseen: Floats, near: Near) -> Bools:
