@@ -88,7 +88,7 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
             check_files(embedded.url, other, 10.0)
     for each in started:
         done = each.result()
-        assert done.returncode == 1
+        assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1
         assert "elsewhere than in" in done.stderr
     embedded.leave()

@@ -126,6 +126,6 @@ def test_train_computes_a_policy_too(tmp_path):
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):
-    done = specshield(*arguments, code=1)
+    done = specshield(*arguments, code=2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr
