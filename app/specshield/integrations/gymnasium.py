@@ -43,9 +43,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     dynamics do not show that. settings: of `LocalShield.session`; by default the environment moves exactly
     like the shield's robot. Each episode has its own seed, made from the seeds of `settings` and of `reset`.
 
-    Raises InputError at once for a seed that is no whole number. `reset` raises RobotError unless the actions
-    are numbered like the robot's, and InfeasibleStart if the rule cannot be kept. `step` raises InputError
-    for an action that does not exist. Both raise InputError if `possible` does not return A booleans.
+    Raises InputError at once for a `shield` of another type and for a seed that is no whole number. `reset`
+    raises RobotError unless the actions are numbered like the robot's, and InfeasibleStart if the rule cannot
+    be kept. `step` raises InputError for an action that does not exist. Both raise InputError if `possible`
+    does not return A booleans.
     """
 
     def __init__(
@@ -58,6 +59,9 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         possible: Callable[[Environment], ArrayLike] | None = None,
         **settings: Any,
     ) -> None:
+        if not (isinstance(shield, LocalShield) or callable(shield)):
+            expected = "a LocalShield, such as LocalShield.shipped('case1'), or a function that makes one"
+            raise InputError("this is no shield", path="shield", got=shield, expected=expected)
         given = {"shield": shield, "pose_of": pose_of, "logits": logits, "possible": possible, **settings}
         gymnasium.utils.RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)
         gymnasium.Wrapper.__init__(self, env)
