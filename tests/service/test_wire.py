@@ -97,7 +97,7 @@ def test_a_right_that_the_stores_user_lacks_is_told_alike_however_it_was_asked(t
         url = f"redis://alice:secret@127.0.0.1:{port}"
         async with aclosing(Store(url, 60.0, 60)) as store:
             for right, call in (
-                ("-evalsha", lambda store: store.load("@it")),
+                ("-@scripting", lambda store: store.load("@it")),
                 ("-hset", lambda store: store._write("@it", b"", Change(b"x", config=b"y"))),
                 ("-zlexcount", lambda store: store.count(None)),
                 ("resetkeys", lambda store: store.load("@it")),
