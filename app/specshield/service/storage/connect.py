@@ -100,6 +100,22 @@ class _Cluster(redis.asyncio.cluster.RedisCluster):
     becomes a ConnectionError as for any store that cannot be reached.
     """
 
+    async def initialize(self, *args: Any, **kwargs: Any) -> Any:
+        """redis-py asks the first master what commands there are, and if that one is gone, asks it again at
+        each call, whichever node has the keys. So here the next call, or the next try, begins with another.
+        """
+        tried = 0
+        while True:
+            tried += 1
+            try:
+                return await super().initialize(*args, **kwargs)
+            except BaseException as error:  # also a caller whose time is over
+                masters, known = self.get_primaries(), self.nodes_manager.nodes_cache
+                for first in masters[:1]:
+                    known[first.name] = known.pop(first.name)
+                if tried >= len(masters) or not isinstance(error, redis.ConnectionError | redis.TimeoutError):
+                    raise
+
     async def execute_command(self, *args: Any, **kwargs: Any) -> Any:
         try:
             return await super().execute_command(*args, **kwargs)
