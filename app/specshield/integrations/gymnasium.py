@@ -59,10 +59,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         possible: Callable[[Environment], ArrayLike] | None = None,
         **settings: Any,
     ) -> None:
-        if not (isinstance(shield, LocalShield) or callable(shield)):
+        given = {"shield": shield, "pose_of": pose_of, "logits": logits, "possible": possible, **settings}
+        if not (isinstance(given["shield"], LocalShield) or callable(shield)):
             expected = "a LocalShield, such as LocalShield.shipped('case1'), or a function that makes one"
             raise InputError("this is no shield", path="shield", got=shield, expected=expected)
-        given = {"shield": shield, "pose_of": pose_of, "logits": logits, "possible": possible, **settings}
         gymnasium.utils.RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
