@@ -143,6 +143,12 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "SPECSHIELD_MAPS_DIR is not valid: '",
             "a folder that exists",
         ),
+        (
+            "worker",
+            {"SPECSHIELD_DATA_DIR": " data"},
+            "SPECSHIELD_DATA_DIR is not valid: ' data'",
+            "neither begins nor ends with a space",
+        ),
         ("serve", {"SPECSHIELD_WORKER": "yep"}, "SPECSHIELD_WORKER is not valid: 'yep'", "true or false"),
         (
             "serve",
