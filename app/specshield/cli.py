@@ -11,7 +11,6 @@ import os
 import signal
 import socket
 import sys
-import tempfile
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -139,7 +138,7 @@ def serve(
     import uvicorn
 
     from specshield.service.heavy.pool import STARTS_WITHIN
-    from specshield.service.leaving import GRACE, notice_killed
+    from specshield.service.leaving import GRACE, folder_of_counts, notice_killed
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
@@ -181,7 +180,7 @@ def serve(
     if workers == 1:
         uvicorn.run(create_app(settings, embedded), **options)
         return
-    with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
+    with folder_of_counts() as folder:
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
         notice_killed()
         uvicorn.run("specshield.service.app:create_app", factory=True, **options)
