@@ -11,12 +11,12 @@ import os
 import signal
 import socket
 import sys
-import tempfile
+import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 from specshield import __version__
 from specshield.errors import InputError, SpecshieldError, StoreError
@@ -33,6 +33,7 @@ NEEDS_SERVER = """\
 This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
+FAILED = 2  # exit status after an error, as typer has it for wrong arguments
 EXTRAS = {"torch": "train", **dict.fromkeys(("foxglove", "pyarrow", "rerun", "rosbags"), "recordings")}
 
 
@@ -50,14 +51,15 @@ def _about(
 
 
 def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
-    """Runs a command line with these commands. Expected errors are shown in one line.
+    """Runs a command line with these commands. Expected errors are shown in one line. After an error of any
+    kind the exit status is FAILED: by 1, a command says that it worked and what it looked at is not well.
 
     options: of the `typer.Typer`.
     """
     if sys.version_info < (3, 11):
-        sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
+        _fail(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
-        sys.exit(NEEDS_SERVER)
+        _fail(NEEDS_SERVER)
     gc.set_threshold(50_000)  # [objects]: collections took a tenth of a start, and modules are never freed
     kernels = Path(sys.prefix) / "numba-cache"  # the folder of `make`, so that its compiled kernels are used
     if kernels.is_dir():
@@ -76,26 +78,36 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
             else:
                 app.command(command.__name__.removesuffix("_policy").replace("_", "-"))(command)
         app()
-    except SpecshieldError as error:
+    except Exception as error:
         from specshield.sim.progress import StatusLine
 
         StatusLine().clear()  # a command may have left a line there
-        sys.exit(str(error))
-    except OSError as error:
+        _fail(_told(error) or traceback.format_exc().rstrip())
+
+
+def _fail(message: str) -> NoReturn:
+    print(message, file=sys.stderr)
+    sys.exit(FAILED)
+
+
+def _told(error: Exception) -> str | None:
+    """An expected error in one line; None for any other."""
+    if isinstance(error, SpecshieldError):
+        return str(error)
+    if isinstance(error, OSError):
         if error.filename is not None:  # most likely a file or folder that the caller named
-            sys.exit(f"{error.filename} cannot be used: {error.strerror}")
+            return f"{error.filename} cannot be used: {error.strerror}"
         if error.errno in (errno.ENOSPC, errno.EDQUOT):  # where a write fails, Python names no file
-            sys.exit(f"what this command writes is not complete: {error.strerror}")
-        raise
-    except ModuleNotFoundError as error:
+            return f"what this command writes is not complete: {error.strerror}"
+    if isinstance(error, ModuleNotFoundError):
         from specshield.commands.doctor import missing_parts
 
         missing = (error.name or "").split(".")[0]
         if missing in EXTRAS:
-            sys.exit(f"This command needs {missing}: pip install 'specshield[{EXTRAS[missing]}]'")
+            return f"This command needs {missing}: pip install 'specshield[{EXTRAS[missing]}]'"
         if missing_parts(missing.replace("_", "-")):
-            sys.exit(NEEDS_SERVER)
-        raise
+            return NEEDS_SERVER
+    return None
 
 
 def _commands() -> Iterator[Callable[..., None]]:
@@ -126,7 +138,7 @@ def serve(
     import uvicorn
 
     from specshield.service.heavy.pool import STARTS_WITHIN
-    from specshield.service.leaving import GRACE, notice_killed
+    from specshield.service.leaving import GRACE, folder_of_counts, notice_killed
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
@@ -168,7 +180,7 @@ def serve(
     if workers == 1:
         uvicorn.run(create_app(settings, embedded), **options)
         return
-    with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
+    with folder_of_counts() as folder:
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
         notice_killed()
         uvicorn.run("specshield.service.app:create_app", factory=True, **options)

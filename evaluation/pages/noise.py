@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 
+from evaluation.calibration import kept_in
 from evaluation.disturbance import DISTURBANCES
 from evaluation.evaluation import read
 from evaluation.pages.tables import Found, Results, beside_ours, better, kl, title
@@ -63,8 +63,7 @@ def _table(experiments: Sequence[Results]) -> str:
 
 def _calibrations(found: Found) -> Iterator[str]:
     for kept, results in found.items():
-        path = kept / "calibration.json"
-        for made in json.loads(path.read_text()).values() if path.exists() else ():
+        for made in kept_in(kept).values():
             at = f"@{made['rounded']:g}{made['asked']}"
             records = [record for record in read(kept) if record.method.endswith(at)]
             for method in dict.fromkeys(record.method for record in records):

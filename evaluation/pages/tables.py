@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from evaluation.calibration import kept_in
 from evaluation.experiment import CERTIFYING, split
 from evaluation.results import markdown, share
 
@@ -186,8 +186,7 @@ def commands(folder: Path, found: Found) -> str:
 
 def _as_asked(kept: Path, method: str) -> str:
     """The method as it was asked for: NAME@conformal/K where a calibration in `kept` made its margin."""
-    path = kept / "calibration.json"
-    for name, made in (json.loads(path.read_text()) if path.exists() else {}).items():
+    for name, made in kept_in(kept).items():
         margin = f"@{made['rounded']:g}{made['asked']}"
         if method.endswith(margin):
             return f"{method.removesuffix(margin)}@{name}"

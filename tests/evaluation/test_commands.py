@@ -34,7 +34,7 @@ def test_it_runs_without_being_installed_too():
         for words in (["--help"], ["evaluate", "--case", "9"])
     )
     assert "evaluate" in told.stdout
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     assert "one of case1, case2" in refused.stderr
 
 
@@ -44,7 +44,7 @@ def test_without_mujoco_it_is_said_how_to_get_it():
         "import runpy; runpy.run_module('evaluation', run_name='__main__')"
     )
     refused = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True)
-    assert refused.returncode == 1
+    assert refused.returncode == 2
     (line,) = refused.stderr.splitlines()
     assert "pip install -e './evaluation[mujoco]'" in line
 
@@ -64,7 +64,7 @@ def test_without_mujoco_it_is_said_how_to_get_it():
 def test_what_cannot_be_run_is_refused_before_the_rest_is_run(tmp_path, words, told):
     name, option, value = words.split()
     out = tmp_path / "out"
-    refused = specshield(name, option, value, "--out", str(out), "--page", str(tmp_path / "page.md"), code=1)
+    refused = specshield(name, option, value, "--out", str(out), "--page", str(tmp_path / "page.md"), code=2)
     assert told in refused.stderr
     assert not out.exists()
 
@@ -126,7 +126,7 @@ def test_report_writes_a_page_and_its_pictures(tmp_path):
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):
-    done = specshield("evaluate", *arguments, code=1)
+    done = specshield("evaluate", *arguments, code=2)
     (line,) = done.stderr.splitlines()
     assert said in line
 
@@ -134,12 +134,12 @@ def test_a_mistake_is_told_in_a_line(arguments, said):
 def test_a_case_that_is_not_is_told_before_worlds_are_run(tmp_path):
     """It came after the runs of the cases before it; and 1 was no name of case1, as it is elsewhere."""
     asked = ("--case", "1,9", "--world", "told", "--sensing", "none", "--runs", "1", "--processes", "1")
-    refused = specshield("worlds", *asked, "--out", str(tmp_path), code=1)
+    refused = specshield("worlds", *asked, "--out", str(tmp_path), code=2)
     assert not refused.stdout
     (line,) = refused.stderr.splitlines()
     assert line.startswith("there is no case 'case9'")
     house = ("--case", "0-house.json", "--world", "told", "--sensing", "none", "--runs", "1")
-    (line,) = specshield("worlds", *house, "--out", str(tmp_path), code=1).stderr.splitlines()
+    (line,) = specshield("worlds", *house, "--out", str(tmp_path), code=2).stderr.splitlines()
     assert line.startswith("there is no house '0-house.json'")  # a number at its beginning is no case's
 
 
@@ -163,7 +163,7 @@ def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
     ],
 )
 def test_a_name_that_nothing_has_is_refused(command, option, given, tmp_path):
-    refused = specshield(command, option, given, "--out", str(tmp_path), code=1)
+    refused = specshield(command, option, given, "--out", str(tmp_path), code=2)
     (line,) = refused.stderr.splitlines()
     assert line.startswith(f"{option}: ")
     assert "nope" in line
@@ -175,7 +175,7 @@ def test_a_page_that_cannot_be_written_is_told_before_anything_runs(command, tmp
     (tmp_path / "file").touch()
     for page, said in ((tmp_path / "file" / "page.md", "File exists"), (tmp_path, "this is a folder")):
         asked = ("--page", str(page), "--out", str(tmp_path / "out"))
-        refused = specshield(command, *asked, code=1)
+        refused = specshield(command, *asked, code=2)
         assert not refused.stdout
         (line,) = refused.stderr.splitlines()
         assert line.startswith("--page")

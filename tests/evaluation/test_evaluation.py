@@ -214,6 +214,16 @@ def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):
     others = calibration.calibrated(EXPERIMENT, "paper@conformal/8", tmp_path, 1)
     assert others == chosen.replace("ours", "paper")  # no method has a margin of its own
     assert calibration.calibrated(EXPERIMENT, "ours@0.1", tmp_path, 1) == "ours@0.1"
+    for garbled in (
+        '{"conformal/8": {"rou',
+        "[]",
+        "\xff",
+        '{"conformal/8": {"rounded": "a"}}',
+        '{"conformal/8": 1}',
+    ):
+        (tmp_path / "calibration.json").write_text(garbled, "latin-1")
+        with pytest.raises(InputError, match=r"calibration\.json is no calibration"):
+            calibration.calibrated(EXPERIMENT, asked, tmp_path, 1)
 
 
 @pytest.fixture

@@ -163,6 +163,12 @@ def test_a_seed_and_a_mask_that_cannot_be_used_are_refused(path: str, wrong: Any
         ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, **{path: wrong}).reset()
 
 
+@pytest.mark.parametrize("wrong", ["case1", None])
+def test_what_is_no_shield_is_refused_at_once(wrong: Any) -> None:
+    with pytest.raises(InputError, match=r"this is no shield.*; expected a LocalShield"):
+        ShieldWrapper(House(), wrong, lambda env: START)
+
+
 def test_a_seed_of_numpy_is_a_seed() -> None:
     shield, actions = LocalShield.shipped("case1"), list[int]()
     for seed in (3, np.int64(3)):

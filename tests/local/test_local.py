@@ -408,6 +408,9 @@ def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -
         signals={"load": 0.0}, robot=ROBOT,
     )  # fmt: skip
     assert len(repr(made)) < 100  # what a notebook shows
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"cannot be written there: Not a directory; got '.*/file/policy'"):
+        made.save(tmp_path / "file" / "policy")
     made.save(tmp_path / "policy")
     again = LocalShield.load(tmp_path / "policy")
     sessions = [each.session(initial_pose=(1.0, 1.0, 0.0)) for each in (made, again)]

@@ -152,7 +152,7 @@ def test_types_that_a_route_does_not_take(client, kept):
 def serve(*options, **environment):
     """What a server that must not start says."""
     done = run_specshield("serve", "--port", "0", *options, **environment)
-    assert done.returncode == 1, done.stderr
+    assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     return done.stderr
 

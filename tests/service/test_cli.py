@@ -34,7 +34,7 @@ main()
 def test_what_is_not_installed_is_said(parts, arguments, told):
     code = WITHOUT.format(parts=parts, arguments=arguments)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HUNG)
-    assert run.returncode == 1
+    assert run.returncode == 2
     assert told in run.stderr
     assert "Traceback" not in run.stderr
 
@@ -143,6 +143,12 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "SPECSHIELD_MAPS_DIR is not valid: '",
             "a folder that exists",
         ),
+        (
+            "worker",
+            {"SPECSHIELD_DATA_DIR": " data"},
+            "SPECSHIELD_DATA_DIR is not valid: ' data'",
+            "neither begins nor ends with a space",
+        ),
         ("serve", {"SPECSHIELD_WORKER": "yep"}, "SPECSHIELD_WORKER is not valid: 'yep'", "true or false"),
         (
             "serve",
@@ -156,7 +162,7 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
     (tmp_path / "file").touch()
     given = {name: value.replace("{folder}", str(tmp_path)) for name, value in environment.items()}
     run = run_specshield(command, cwd=tmp_path, **given)
-    assert run.returncode == 1
+    assert run.returncode == 2
     (line,) = run.stderr.splitlines()
     assert told in line
     assert expected in line.partition("; expected ")[2]
@@ -172,7 +178,7 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
 )
 def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path, url, cause):
     run = run_specshield("worker", cwd=tmp_path, REDIS_URL=url.format(port=free_port()))
-    assert run.returncode == 1
+    assert run.returncode == 2
     told = run.stderr.splitlines()[-1]
     assert re.fullmatch(f"REDIS_URL: the store cannot be reached: {cause}", told)
     assert "Traceback" not in run.stderr
@@ -198,7 +204,7 @@ def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
     folder.mkdir(parents=True)
     (folder / "appendonly.aof.manifest").write_text("not a manifest\n")
     run = run_specshield("serve", "--port", "0", *more, SPECSHIELD_DATA_DIR=str(tmp_path))
-    assert run.returncode == 1
+    assert run.returncode == 2
     (line,) = run.stderr.splitlines()
     assert line.startswith("the embedded store does not start: Invalid AOF manifest file format; see ")
     assert line.endswith("store.log")
@@ -208,7 +214,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         run = run_specshield("serve", "--port", port, SPECSHIELD_DATA_DIR=str(tmp_path))
-    assert run.returncode == 1
+    assert run.returncode == 2
     (line,) = run.stderr.splitlines()
     assert line.startswith(f"the server cannot listen on 127.0.0.1 at port {port}: Address already in use;")
     assert "--port 0" in line

@@ -200,7 +200,7 @@ def test_a_run_that_rq_kills_at_its_limit_says_so_too(tmp_path, status):
     store.join()
     try:
         jobs, id = Jobs(Settings(data_dir=tmp_path, synthesis_timeout=30)), "a" * 64
-        jobs.start(id, "planner")
+        jobs.start(id, "planner", "")
         worker = _Worker(store.url, jobs, ["planner"], [])
         job, _ = Queue.dequeue_any(worker.queues, 1, connection=worker.connection, serializer=JSONSerializer)
         job.ended_at = datetime.now(timezone.utc)
@@ -343,7 +343,7 @@ def test_what_nobody_makes_says_so_and_a_worker_that_dies_as_it_starts_is_not_of
     store.join()
     try:
         jobs = Jobs(Settings(data_dir=tmp_path))
-        jobs.start("a" * 64, "planner")
+        jobs.start("a" * 64, "planner", "")
         waiting = jobs.get("a" * 64)
         assert (waiting.status, "none is running" in waiting.error) == ("queued", True)
         jobs.worker_lives(["planner"])
@@ -383,15 +383,43 @@ def test_a_run_that_left_the_queue_and_never_began_fails_and_can_be_asked_for_ag
     try:
         jobs, id = Jobs(Settings(data_dir=tmp_path)), "a" * 64
         jobs.worker_lives(["planner"])
-        jobs.start(id, "planner")
+        jobs.start(id, "planner", "")
         wait_for(lambda: not jobs.redis.exists(_alive(id)))
         assert jobs.get(id).status == "queued"  # it waits, for however long
         worker = _Worker(store.url, jobs, ["planner"], [])
         job, _ = Queue.dequeue_any(worker.queues, 1, connection=worker.connection, serializer=JSONSerializer)
         wait_for(lambda: jobs.get(id).status == "failed")
         assert "worker is gone" in jobs.get(id).error
-        jobs.start(id, "planner")
+        jobs.start(id, "planner", "")
         assert jobs.get(id).status == "queued"
         assert not jobs.report(*job.args, status="training")  # the worker was only slow, and comes too late
+    finally:
+        store.leave()
+
+
+def test_the_owners_of_keys_take_turns_in_a_queue(tmp_path):
+    """One that asks for many policies does not keep another's one waiting for all of them."""
+    store = EmbeddedStore(tmp_path)
+    store.join()
+    try:
+        jobs, asked = Jobs(Settings(data_dir=tmp_path)), iter("abcdefghijkl")
+        worker = _Worker(store.url, jobs, ["planner"], [])
+
+        def start(*owners):
+            for owner in owners:
+                jobs.start(f"{owner}-{next(asked)}", "planner", owner)
+
+        def take(count):
+            for _ in range(count):
+                job, _ = Queue.dequeue_any(
+                    worker.queues, 1, connection=worker.connection, serializer=JSONSerializer
+                )
+                worker.prepare_execution(job)
+                yield job.args[0]
+
+        start("alice", "alice", "alice", "bob", "bob", "", "alice")
+        assert list(take(2)) == ["alice-a", "bob-d"]  # which are now made, by two workers
+        start("carol", "bob")
+        assert list(take(7)) == ["-f", "carol-h", "alice-b", "bob-e", "alice-c", "bob-i", "alice-g"]
     finally:
         store.leave()

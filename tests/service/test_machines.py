@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -17,8 +18,9 @@ from specshield.errors import InputError, SpecshieldError
 from specshield.service.leaving import ECHO
 from specshield.service.library.files import Kept
 from specshield.service.settings import Settings
+from specshield.service.storage.connect import connect
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.marker import check_files
+from specshield.service.storage.marker import KEY, check_files, stay_marked
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
 from tests.serving import HUNG, RunningServer, children, command_line, run_specshield, serving, wait_for
 
@@ -88,7 +90,7 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
             check_files(embedded.url, other, 10.0)
     for each in started:
         done = each.result()
-        assert done.returncode == 1
+        assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1
         assert "elsewhere than in" in done.stderr
     embedded.leave()
@@ -97,6 +99,24 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
         lines = [json.loads(line) for line in server.log.read_text().splitlines()]
     (told,) = (line["message"] for line in lines if line["level"] == "warning")
     assert "the store does not know the files" in told
+
+
+def test_a_store_that_was_emptied_gets_its_name_back_from_a_server_that_runs(tmp_path):
+    embedded, place = EmbeddedStore(tmp_path), str(tmp_path / "files")
+    embedded.join()
+
+    async def scene():
+        async with connect(embedded.url) as store:
+            mark = await store.get(KEY)
+            running = asyncio.create_task(stay_marked(embedded.url, place, 60.0, every=0.01))
+            await store.flushall()
+            while await store.get(KEY) != mark:
+                await asyncio.sleep(0.01)
+            running.cancel()
+
+    check_files(embedded.url, place, 60.0)
+    asyncio.run(scene())
+    embedded.leave()
 
 
 def kept(tmp_path: Path, name: str) -> Kept:

@@ -5,7 +5,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 import redis
 
 from specshield.errors import StoreError
+from specshield.service.leaving import COUNTS, folder_of_counts
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import INDEX, Change, Record, Store, keys
@@ -159,7 +162,8 @@ def test_two_servers_share_one_store_and_one_step_has_one_answer(tmp_path):
         assert step(b, session, 1).status_code == 200
 
 
-def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_supervisor(tmp_path):
+def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_supervisor(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # as that of the server
     with serving(tmp_path, "--workers", "2") as server:
         with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
             session = begin(client)
@@ -176,8 +180,13 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
         assert f"specshield_requests_total{{{route}}} 8.0" in told
         pids = [store_pid(tmp_path), *children(server.process.pid)]
         assert len(pids) >= 3
-        server.kill()
-        wait_for(lambda: not any(map(runs, pids)))
+        with folder_of_counts() as own:
+            (folder,) = {str(each) for each in tmp_path.glob(f"{COUNTS}*")} - {own}  # that of the server
+            server.kill()
+            wait_for(lambda: not any(map(runs, pids)))
+            with folder_of_counts():
+                assert (Path(own).exists(), Path(folder).exists()) == (True, False)
+        assert not list(tmp_path.glob(f"{COUNTS}*"))
 
 
 STEP = {"t": 0, "poses": [START], "logits": LOGITS}

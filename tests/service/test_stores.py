@@ -397,6 +397,24 @@ def test_a_node_that_serves_nothing_for_now_is_told_at_once(tmp_path):
         asyncio.run(scene(there.nodes[0], there.url))
 
 
+def test_a_server_that_starts_while_a_master_is_gone_for_good_serves_what_the_others_have(tmp_path):
+    """Though it is the first one, which redis-py asks what commands there are."""
+
+    async def scene(url: str) -> None:
+        store = connect(url, socket_timeout=60.0)
+        name = next(name for name in map(str, range(1000)) if key_slot(name.encode()) > 2 * FIRST)
+        await store.set(name, 1)
+        assert await store.get(name) == b"1"
+        await store.aclose()
+
+    with cluster(tmp_path / "store") as there:
+        for node in there.nodes[1:3]:
+            node.config_set("cluster-require-full-coverage", "no")
+        os.kill(there.nodes[3].info("server")["process_id"], signal.SIGKILL)
+        there.first.kill()
+        asyncio.run(scene(there.url))
+
+
 def test_a_cluster_that_is_away_is_said_to_be(tmp_path):
     away = "redis+cluster://127.0.0.1:1"
     with (

@@ -1,5 +1,6 @@
 import asyncio
 import time
+from contextlib import aclosing
 from types import SimpleNamespace
 
 import hiredis
@@ -7,8 +8,11 @@ import pytest
 import redis
 
 from specshield.errors import StoreError
-from specshield.service.storage.connect import reaching
+from specshield.service.storage.connect import USER, reaching
+from specshield.service.storage.store import Change, Store
 from specshield.service.storage.wire import PART, Script, Wire, _Link
+from tests.serving import free_port, wait_for
+from tests.stores import VALKEY, answers, needs_redis, running
 
 
 def test_an_answer_that_comes_too_late_is_nobody_elses():
@@ -82,6 +86,37 @@ def test_a_refusal_is_told_at_once_with_its_reason():
     began = time.monotonic()
     asyncio.run(scene())
     assert time.monotonic() - began < 0.5 * PART * 60.0
+
+
+@pytest.mark.parametrize("program", [pytest.param("redis-server", marks=needs_redis), VALKEY])
+def test_a_right_that_the_stores_user_lacks_is_told_alike_however_it_was_asked(tmp_path, program):
+    """And no caller is told the user's name, which only the log has."""
+    port, told = free_port(), set()
+
+    async def scene():
+        url = f"redis://alice:secret@127.0.0.1:{port}"
+        async with aclosing(Store(url, 60.0, 60)) as store:
+            for right, call in (
+                ("-@scripting", lambda store: store.load("@it")),
+                ("-hset", lambda store: store._write("@it", b"", Change(b"x", config=b"y"))),
+                ("-zlexcount", lambda store: store.count(None)),
+                ("resetkeys", lambda store: store.load("@it")),
+            ):
+                default.acl_setuser(
+                    "alice", reset=True, enabled=True, passwords=["+secret"], categories=["+@all"]
+                )
+                default.execute_command("ACL", "SETUSER", "alice", "~*", right)
+                with pytest.raises(StoreError) as caught:
+                    await call(store)
+                told.add((caught.value.message, caught.value.expected))
+
+    with (
+        running(tmp_path, "--port", str(port), "--save", "", program=program),
+        redis.Redis(port=port) as default,
+    ):
+        wait_for(lambda: answers(default))
+        asyncio.run(scene())
+    assert told == {("the store refuses: its user lacks a right", USER)}
 
 
 def test_a_server_that_goes_while_a_connection_is_made_cannot_be_reached():

@@ -9,6 +9,7 @@ import pytest
 
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
+from specshield.sim.training import _alone_in
 from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
 
 
@@ -109,6 +110,16 @@ def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     load_policy((out / "policy.safetensors").read_bytes(), card, case.task)
 
 
+def test_two_that_train_in_one_folder_do_not_remove_each_others_checkpoint(tmp_path):
+    kept = tmp_path / "checkpoint" / "kept"
+    kept.parent.mkdir()
+    kept.touch()
+    with _alone_in(tmp_path):
+        done = specshield("train", "--case", "case1", "--out", str(tmp_path), code=2)
+    assert "another `specshield train` makes a policy in" in done.stderr
+    assert kept.exists()
+
+
 def test_train_computes_a_policy_too(tmp_path):
     done = specshield("train", "--case", "case1", "--method", "reachability", "--out", str(tmp_path))
     assert "feasible from" in done.stdout
@@ -126,6 +137,6 @@ def test_train_computes_a_policy_too(tmp_path):
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):
-    done = specshield(*arguments, code=1)
+    done = specshield(*arguments, code=2)
     assert said in done.stderr
     assert "Traceback" not in done.stderr

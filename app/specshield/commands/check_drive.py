@@ -25,7 +25,8 @@ def check_drive(
 ) -> None:
     """Say whether a drive in a rosbag2 kept the rule, and from which step on no way to keep it was found.
 
-    The exit status is 1 if the rule is broken, or open while no way to keep it was found; else 0.
+    The exit status is 1 if the rule is broken, or open while no way to keep it was found, 2
+    after an error, such as a bag that cannot be read; else 0.
     """
     from specshield.local import LocalShield
     from specshield.recordings import drive

@@ -155,7 +155,7 @@ def _disk(settings: Settings) -> Iterator[Finding]:
 
 
 def _store(settings: Settings) -> Iterator[Finding]:
-    from specshield.service.storage.connect import FAILURES, connect, drops
+    from specshield.service.storage.connect import FAILURES, connect, drops, naming
     from specshield.service.storage.marker import check_first
     from specshield.service.training.jobs import Jobs
 
@@ -163,9 +163,12 @@ def _store(settings: Settings) -> Iterator[Finding]:
         return
     began = time.perf_counter()
     try:
-        with contextlib.closing(
-            connect(settings.redis_url, blocking=True, socket_timeout=settings.store_timeout)
-        ) as store:
+        with (
+            naming(settings),
+            contextlib.closing(
+                connect(settings.redis_url, blocking=True, socket_timeout=settings.store_timeout)
+            ) as store,
+        ):
             store.ping()
             took = 1000 * (time.perf_counter() - began)
             yield Finding("ok", f"the store at REDIS_URL answers in {took:.1f} ms")

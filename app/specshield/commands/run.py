@@ -22,7 +22,10 @@ def run_policy(
     shaping: Annotated[str, typer.Option(help="A session's shaping: projection, lookahead.")] = "projection",
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
 ) -> None:
-    """Drive a simulated robot through an episode, with and without the shield, and draw both."""
+    """Drive a simulated robot through an episode, with and without the shield, and draw both.
+
+    The exit status is 0 if the shielded robot kept the rule, 1 if not, 2 after an error.
+    """
     from specshield.commands.serving import client_of
     from specshield.lookahead.preferences import check_shaping
     from specshield.service.settings import read_settings

@@ -43,9 +43,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     dynamics do not show that. settings: of `LocalShield.session`; by default the environment moves exactly
     like the shield's robot. Each episode has its own seed, made from the seeds of `settings` and of `reset`.
 
-    Raises InputError at once for a seed that is no whole number. `reset` raises RobotError unless the actions
-    are numbered like the robot's, and InfeasibleStart if the rule cannot be kept. `step` raises InputError
-    for an action that does not exist. Both raise InputError if `possible` does not return A booleans.
+    Raises InputError at once for a `shield` of another type and for a seed that is no whole number. `reset`
+    raises RobotError unless the actions are numbered like the robot's, and InfeasibleStart if the rule cannot
+    be kept. `step` raises InputError for an action that does not exist. Both raise InputError if `possible`
+    does not return A booleans.
     """
 
     def __init__(
@@ -59,6 +60,9 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         **settings: Any,
     ) -> None:
         given = {"shield": shield, "pose_of": pose_of, "logits": logits, "possible": possible, **settings}
+        if not (isinstance(given["shield"], LocalShield) or callable(shield)):
+            expected = "a LocalShield, such as LocalShield.shipped('case1'), or a function that makes one"
+            raise InputError("this is no shield", path="shield", got=shield, expected=expected)
         gymnasium.utils.RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible

@@ -16,7 +16,7 @@ import numpy as np
 from specshield.caution.signals import any_signal
 from specshield.client.models import SessionInfo
 from specshield.client.wire import pose_values
-from specshield.errors import MapError, NotFound, PolicyError
+from specshield.errors import InputError, MapError, NotFound, PolicyError
 from specshield.local.rule import Rule, told
 from specshield.local.session import LocalSession
 from specshield.local.settings import plain, read_settings
@@ -137,14 +137,21 @@ class LocalShield:
         return LocalShield(make_shield([policy]), card, weights)
 
     def save(self, folder: str | Path) -> None:
-        """Write the files that `load` reads. A server takes them too, in a folder of its `models_dir`."""
+        """Write the files that `load` reads. A server takes them too, in a folder of its `models_dir`.
+
+        Raises InputError if they cannot be written.
+        """
         folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
         text, image = dump_map(self.task.grid)
-        (folder / "map.yaml").write_text(text)
-        (folder / "map.pgm").write_bytes(image)
-        (folder / "policy.safetensors").write_bytes(self.weights)
-        (folder / "card.json").write_text(json.dumps(dict(self.card), indent=1))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "map.yaml").write_text(text)
+            (folder / "map.pgm").write_bytes(image)
+            (folder / "policy.safetensors").write_bytes(self.weights)
+            (folder / "card.json").write_text(json.dumps(dict(self.card), indent=1))
+        except OSError as error:
+            told = f"the policy cannot be written there: {error.strerror}"
+            raise InputError(told, path="folder", got=str(folder), expected="a folder to write to") from error
 
     def session(self, **options: Unpack[Beginning]) -> LocalSession:
         """Begin at `initial_pose`; the options are those of the SDK's `sessions.create`, without policies.

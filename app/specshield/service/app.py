@@ -37,7 +37,7 @@ from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.connect import drops
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
-from specshield.service.storage.marker import check_files
+from specshield.service.storage.marker import check_files, stay_marked
 from specshield.service.storage.objects import open_objects
 from specshield.service.training.children import TrainingWorker, tend
 from specshield.service.training.jobs import Jobs
@@ -123,9 +123,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     trains = settings.redis_url is None if settings.worker is None else settings.worker
     worker = TrainingWorker(settings) if trains else None
     heavy, startup = Heavy(settings), Startup()
+    marked = url, settings.files_at, settings.store_timeout
 
     def check() -> None:
-        check_files(url, settings.files_at, settings.store_timeout)
+        check_files(*marked)
         if (told := drops(jobs.redis)) is not None:
             log.warning("%s; docs/scale.md says which it should be", told)
         if worker is not None:  # comes last, since it takes a processor for a second
@@ -147,6 +148,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         lasting(lambda: prepare(startup, check)),
         *([complete(startup)] if settings.complete else []),
         lasting(lambda: tend(embedded, worker, startup)),
+        lasting(lambda: stay_marked(*marked)),
         *map(lasting, (mover.run, watchers.run, keys.follow)),
     )
     tasks = [asyncio.create_task(each) for each in running]

@@ -1,15 +1,22 @@
 """How a server stops: first /readyz says so, so that balancers send no new requests, and later the server
-stops and closes its streams. Also, how uvicorn's supervisor notices that a worker was killed.
+stops and closes its streams. Also, how uvicorn's supervisor notices that a worker was killed, and how what a
+killed supervisor has left is removed.
 """
 
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import math
+import os
+import shutil
 import signal
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client.multiprocess import mark_process_dead
@@ -18,6 +25,7 @@ from uvicorn.supervisors.multiprocess import Process
 if TYPE_CHECKING:  # the parent of several servers does not need it
     from specshield.service.startup import Startup
 
+COUNTS = "specshield-counts-"  # how the folders of counts begin, below the temporary directory
 ECHO = 1.0  # [s] if a whole group is told to stop, as by systemd, the supervisor tells its workers once more
 GRACE = 10  # [s] for running requests and streams once the server takes no new ones; chosen by hand
 
@@ -65,6 +73,34 @@ def heed_signals(startup: Startup, streams: Streams, drain: float) -> None:
         signal.signal(number, told)
     if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
         signal.signal(signal.SIGHUP, lambda _, frame: told(signal.SIGTERM, frame))
+
+
+@contextmanager
+def folder_of_counts() -> Iterator[str]:
+    """A folder for the counts of several server processes, which is removed at the end of the block. Those
+    that killed supervisors have left are removed too: a supervisor holds a lock on its own.
+    """
+    for left in Path(tempfile.gettempdir()).glob(f"{COUNTS}*"):
+        with suppress(OSError), _locked(left, fcntl.LOCK_NB):  # not one in use, or of another user
+            shutil.rmtree(left)
+    with ExitStack() as held:
+        folder = ""
+        while not os.path.isdir(folder):  # another start may have taken it before it was locked
+            folder = tempfile.mkdtemp(prefix=COUNTS)
+            with suppress(FileNotFoundError):
+                held.enter_context(_locked(folder))
+        held.callback(shutil.rmtree, folder, ignore_errors=True)
+        yield folder
+
+
+@contextmanager
+def _locked(folder: str | Path, more: int = 0) -> Iterator[None]:
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | more)
+        yield
+    finally:
+        os.close(opened)
 
 
 def notice_killed() -> None:

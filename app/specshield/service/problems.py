@@ -18,6 +18,7 @@ from starlette.types import Receive, Scope, Send
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
 from specshield.service.schemas.base import ID, ID_TOLD
+from specshield.service.storage.connect import cause_of
 from specshield.service.storage.objects import unusable
 
 if TYPE_CHECKING:
@@ -170,7 +171,8 @@ def failed() -> Response:
 def tell(scope: Scope, error: SpecshieldError) -> Response:
     """The answer for an error, which is logged too if the server or its store is the reason."""
     if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
-        log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], error.message)
+        told = error.message + (cause_of(error) if isinstance(error, errors.StoreError) else "")
+        log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], told)
     return ProblemResponse(error)
 
 

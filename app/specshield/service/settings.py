@@ -6,7 +6,7 @@ import os
 import re
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AliasChoices, Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -97,6 +97,13 @@ class Settings(BaseSettings):
     complete: bool = True  # whether to compile, once ready, the kernels that only some sessions need
     training_timeout: LongSeconds = 6 * 3600  # longest training run of a method that learns [s]
     synthesis_timeout: LongSeconds = 600  # longest run of a method that computes its policies [s]
+
+    @field_validator("data_dir", "data_url", "redis_url", mode="before")
+    @classmethod
+    def _has_no_space_around(cls, place: Any) -> Any:
+        if isinstance(place, str) and place != place.strip():  # it would be part of a folder's name
+            raise ValueError("a value that neither begins nor ends with a space")
+        return place
 
     @field_validator("models_dir", "maps_dir")
     @classmethod

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,22 +50,39 @@ def train(
         raise InputError(f"{own} holds a policy already", path="--out", expected=expected)
     out = out or own
     checkpoint, status = out / "checkpoint", StatusLine()
-    if not resume:
-        shutil.rmtree(checkpoint, ignore_errors=True)
-    out.mkdir(parents=True, exist_ok=True)
 
     def show(done: float, seconds_left: float, said: str) -> None:
         status.say(f"{loaded.name}: {said or f'{done:.0%}'}, {duration(seconds_left)} left")
 
-    policy = made_by.make(loaded.task, chosen, Run(seed, dict(loaded.spec), checkpoint, show))
-    status.clear()
-    replace_file(out / "policy.safetensors", policy.weights())
-    (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
-    shutil.rmtree(checkpoint, ignore_errors=True)
+    out.mkdir(parents=True, exist_ok=True)
+    with _alone_in(out):
+        if not resume:
+            shutil.rmtree(checkpoint, ignore_errors=True)
+        policy = made_by.make(loaded.task, chosen, Run(seed, dict(loaded.spec), checkpoint, show))
+        status.clear()
+        replace_file(out / "policy.safetensors", policy.weights())
+        (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
+        shutil.rmtree(checkpoint, ignore_errors=True)
     measured = {"satisfied": "satisfies alone from", "feasible_start": "feasible from"}
     metrics = policy.card["metrics"]
     shares = [f"{words} {metrics[name]:.1%}" for name, words in measured.items() if name in metrics]
     print(f"{out}: {', '.join(shares)}; {duration(time.monotonic() - began)}")
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Raises InputError if another process is in such a block: each would remove the other's checkpoint."""
+    opened = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            told = f"another `specshield train` makes a policy in {folder}"
+            expected = "another folder, or that the other command ends first"
+            raise InputError(told, path="--out", expected=expected) from None
+        yield
+    finally:
+        os.close(opened)
 
 
 def _parse(texts: Sequence[str]) -> dict[str, Any]:

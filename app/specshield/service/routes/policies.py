@@ -101,7 +101,7 @@ def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict
         raise TrainingUnavailable(told, path="method", got=name, expected=expected)
     record = server.policies.add(asked, caller)
     if queued:
-        server.jobs.start(record.id, name)
+        server.jobs.start(record.id, name, caller.name)
     if called is not None:
         server.policies.name(record, caller.name, called)
     return _show(server, record, caller.name)

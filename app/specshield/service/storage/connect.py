@@ -10,6 +10,7 @@ which is for the store; options after a ? are redis-py's, as in ?ssl_ca_certs=/e
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,7 @@ CONNECTIONS = 64  # of one server process to a single store; further calls wait 
 TRIES = 3  # after the first one, all within the caller's time limit. Chosen by hand.
 JOBS = "{specshield}:rq"  # how rq's keys begin in a cluster, so that one node of it has them all
 USER = "a user of the store with the rights that docs/scale.md lists"
+REFUSED = re.compile("NOPERM|ACL failure in script|user executing the script")  # as Redis and Valkey say it
 PORTS = {"sentinel": 26379, "cluster": 6379}
 
 
@@ -68,21 +70,25 @@ def naming(settings: Settings) -> Iterator[None]:
 
 
 def with_cause(error: StoreError) -> StoreError:
-    """The same error, which now says why. For the log and for commands: the cause may name a host, which is
-    not for those who send requests.
+    """The same error, which now says why. For commands: the cause may name a host or a user of the store,
+    which is not for those who send requests.
     """
+    error.message += cause_of(error)
+    return error
+
+
+def cause_of(error: StoreError) -> str:
+    """Why, in brackets, for the log; "" where the message of the error says it already."""
     # After " : <" redis-py shows its clients of the sentinels.
     cause = str(error.__cause__ or "").partition(" : <")[0][:200]
-    if cause not in error.message:
-        error.message = f"{error.message} ({cause})"
-    return error
+    return f" ({cause})" if cause not in error.message else ""
 
 
 def away(error: BaseException) -> StoreError:
     if isinstance(error.__cause__, redis.ResponseError):  # a connection was given up because of this reply
         error = error.__cause__
-    if isinstance(error, redis.exceptions.NoPermissionError):
-        return StoreError(f"the store refuses: {error!s:.200}", expected=USER)
+    if isinstance(error, redis.exceptions.NoPermissionError) or REFUSED.search(str(error)):
+        return StoreError("the store refuses: its user lacks a right", expected=USER)
     if isinstance(error, redis.ResponseError):  # its text says why: the memory is full, it is a replica, ...
         return StoreError(f"the store refuses: {error!s:.200}")
     return StoreError(f"the store cannot be reached: {type(error).__name__}")
@@ -93,6 +99,22 @@ class _Cluster(redis.asyncio.cluster.RedisCluster):
     also those on which other tasks are about to write. Such a write fails with an AttributeError, which here
     becomes a ConnectionError as for any store that cannot be reached.
     """
+
+    async def initialize(self, *args: Any, **kwargs: Any) -> Any:
+        """redis-py asks the first master what commands there are, and if that one is gone, asks it again at
+        each call, whichever node has the keys. So here the next call, or the next try, begins with another.
+        """
+        tried = 0
+        while True:
+            tried += 1
+            try:
+                return await super().initialize(*args, **kwargs)
+            except BaseException as error:  # also a caller whose time is over
+                masters, known = self.get_primaries(), self.nodes_manager.nodes_cache
+                for first in masters[:1]:
+                    known[first.name] = known.pop(first.name)
+                if tried >= len(masters) or not isinstance(error, redis.ConnectionError | redis.TimeoutError):
+                    raise
 
     async def execute_command(self, *args: Any, **kwargs: Any) -> Any:
         try:

@@ -1,18 +1,19 @@
 """Servers and workers of one store have to share their files too, or one does not find what another made.
 
 So the file `store-id` and the store hold the same name. A server or worker that finds other names does not
-start. All calls block.
+start.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import secrets
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any
 
-from specshield.errors import InputError
+from specshield.errors import InputError, StoreError
 from specshield.service.storage.connect import connect, reaching
 from specshield.service.storage.objects import open_objects, without_password
 
@@ -24,7 +25,7 @@ log = logging.getLogger("specshield")
 
 def check_files(url: str, place: str, timeout: float) -> None:
     """Compares the names in the files and in the store, and writes them at the first start. place: the folder
-    or URL of maps and policies. timeout: of the store [s].
+    or URL of maps and policies. timeout: of the store [s]. This blocks.
 
     Raises InputError if the servers of this store use other files, and StoreError if the files or the store
     cannot be reached.
@@ -55,6 +56,19 @@ def check_files(url: str, place: str, timeout: float) -> None:
         mine = files.read(FILE)
     if mine != theirs:
         raise _elsewhere(place)
+
+
+async def stay_marked(url: str, place: str, timeout: float, every: float = 60.0) -> None:
+    """Compares the names again every so many seconds until it is cancelled: a store that was emptied gets its
+    name back before a server with other files gives it another.
+    """
+    while True:
+        await asyncio.sleep(every)
+        with suppress(StoreError):
+            try:
+                await asyncio.to_thread(check_files, url, place, timeout)
+            except InputError as error:
+                log.error("%s", error)
 
 
 def check_first(store: Any, place: str) -> None:

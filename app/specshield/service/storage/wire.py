@@ -82,8 +82,13 @@ class Wire:
 
 
 async def _run(link: _Link, script: Script, keys: Sequence[str], args: Sequence[Any], deadline: float) -> Any:
+    """The first call of a script on a connection carries its text. The server might not know its hash, and if
+    too few replicas follow, the WAIT after that refusal uses up the time in which the text could be sent.
+    """
+    called = ("EVALSHA", script.sha) if script in link.sent else ("EVAL", script.text)
+    link.sent.add(script)
     try:
-        return await link.send(("EVALSHA", script.sha, len(keys), *keys, *args), deadline)
+        return await link.send((*called, len(keys), *keys, *args), deadline)
     except redis.ResponseError as error:
         said = str(error)
         if said.startswith(GONE):
@@ -91,11 +96,13 @@ async def _run(link: _Link, script: Script, keys: Sequence[str], args: Sequence[
             raise redis.ConnectionError(said) from error
         if not said.startswith("NOSCRIPT"):
             raise
-    return await link.send(("EVAL", script.text, len(keys), *keys, *args), deadline)
+    link.sent.discard(script)  # the store has lost it, as after SCRIPT FLUSH
+    return await _run(link, script, keys, args, deadline)
 
 
 class _Link(asyncio.Protocol):
-    """An open connection, taken over from redis-py; `closed` once it cannot be used any more.
+    """An open connection, taken over from redis-py; `closed` once it cannot be used any more. sent: scripts
+    whose text the server has been sent.
 
     With `replicas`, each round of commands ends with a WAIT. Their answers are held until the server says how
     many replicas have followed; errors are not.
@@ -111,6 +118,7 @@ class _Link(asyncio.Protocol):
         self._held = list[tuple[asyncio.Future[Any], Any]]()
         self._loop = asyncio.get_running_loop()
         self._watch: asyncio.TimerHandle | None = None
+        self.sent = set[Script]()
         self.closed = self._transport.is_closing()
 
     async def send(self, command: tuple[Any, ...], deadline: float) -> Any:

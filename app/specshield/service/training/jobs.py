@@ -3,11 +3,15 @@
 A run writes its state only while its `attempt`, the name of its job, is the latest one, so that cancelling
 and asking again are one write each. A run counts as failed if it gives no more signs of life, or if it has
 left the queue and never gave one.
+
+In a queue the owners of API keys take turns: an attempt begins with a mark of its owner.
 """
 
 from __future__ import annotations
 
+import hashlib
 import secrets
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,6 +31,12 @@ from specshield.service.watch import logs
 ENDED = "specshield:jobs:ended"  # a hash from "method state" to the number of runs
 AGAIN = "ask for it again: a method that learns goes on from its last checkpoint"
 SIGN_OF_LIFE = 5  # [s] without a sign of life after which a run, or the last worker, counts as dead
+OWNER = 16  # letters of an attempt that are its owner's mark
+MOVE = """
+if redis.call('LREM', KEYS[1], -1, ARGV[1]) == 1
+    and redis.call('LINSERT', KEYS[1], 'BEFORE', ARGV[2], ARGV[1]) < 1 then
+    redis.call('LPUSH', KEYS[1], ARGV[1])
+end"""
 WRITE = """
 local attempt, status, method = unpack(redis.call('HMGET', KEYS[1], 'attempt', 'status', 'method'))
 if attempt ~= ARGV[1] or status == 'ready' or status == 'failed' then return '' end
@@ -59,14 +69,15 @@ class Jobs:
     def worker_there(self, method: str) -> bool:
         return bool(reached(lambda: self.redis.exists(_worker(method))))
 
-    def start(self, id: str, method: str) -> None:
-        """Queues a run for this policy."""
-        attempt = secrets.token_hex(8)
+    def start(self, id: str, method: str, owner: str) -> None:
+        """Queues a run for this policy, which an owner has asked for."""
+        attempt = hashlib.sha256(owner.encode()).hexdigest()[:OWNER] + secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
         self.sign_of_life(id, attempt)  # for the moment in which the state is written and the queue is not
         with reaching():
             self.redis.hset(_key(id), mapping={**state, "method": method})
             self._enqueue(id, attempt, method)
+            self._take_turn(attempt, method)
         logs.tell("policy queued", policy_id=id, method=method)
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
@@ -81,6 +92,21 @@ class Jobs:
             failure_ttl=24 * 3600,
             at_front=at_front,
         )
+
+    def _take_turn(self, attempt: str, method: str) -> None:
+        """Moves a run from the end of the queue to before the first one whose owner has more runs before it,
+        running or waiting, than this one's owner has.
+        """
+        queue, own = self._queue(method), attempt[:OWNER]
+        running = self.redis.zrange(queue.started_job_registry.key, 0, -1)
+        waiting = [each.decode() for each in self.redis.lrange(queue.key, 0, -1)]
+        before = Counter(each.decode()[:OWNER] for each in running)
+        most = before[own] + sum(each[:OWNER] == own for each in waiting if each != attempt)
+        for other in waiting:
+            if before[other[:OWNER]] > most:
+                self.redis.eval(MOVE, 1, queue.key, attempt, other)
+                return
+            before[other[:OWNER]] += 1
 
     def _queue(self, method: str) -> Queue:
         return Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
@@ -131,7 +157,7 @@ class Jobs:
 
     def hand_back(self, id: str, attempt: str) -> None:
         """Puts a run whose worker stops at the front of the queue, unless another attempt has replaced it."""
-        again = secrets.token_hex(8)
+        again = attempt[:OWNER] + secrets.token_hex(8)
         if method := self.report(id, attempt, attempt=again, status="queued", eta_s=""):
             reached(lambda: self._enqueue(id, again, method, at_front=True))
 

@@ -18,6 +18,7 @@ from rq import Worker, get_current_job
 from rq.job import Job
 from rq.serializers import JSONSerializer
 from rq.timeouts import JobTimeoutException
+from rq.worker import DequeueStrategy
 
 from specshield.errors import SpecshieldError, StoreError
 from specshield.policy.methods import METHODS, Run, available, missing
@@ -71,7 +72,9 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
             second = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=held)
 
     with _regularly(live), reaching():
-        _Worker(url, jobs, methods, others if learner else ()).work(logging_level="WARNING")
+        of = _Worker(url, jobs, methods, others if learner else ())
+        # So that no queue waits for all of another one.
+        of.work(logging_level="WARNING", dequeue_strategy=DequeueStrategy.ROUND_ROBIN)
     raise StoreError(
         "the worker lost the store and cannot go on; rq's last lines in the log say why",
         expected="a store that answers",

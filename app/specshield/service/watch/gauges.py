@@ -9,6 +9,7 @@ import anyio
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from specshield.errors import StoreError
+from specshield.service.storage.connect import cause_of
 from specshield.service.storage.store import Store
 from specshield.service.training.jobs import Jobs
 
@@ -32,7 +33,7 @@ class Gauges:
                 try:
                     self._found = await self._families()
                 except StoreError as error:
-                    log.warning("/metrics tells nothing of the store now: %s", error)
+                    log.warning("/metrics tells nothing of the store now: %s%s", error, cause_of(error))
                     self._found = [_up(0)]
                 self._asked = time.monotonic()
         return self._found
