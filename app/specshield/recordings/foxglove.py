@@ -1,8 +1,8 @@
 """Writes a session as MCAP with Foxglove's schemas: map, pose and scene, and each decision as JSON.
 
-Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/decision` (specshield.Decision: the service's
-answer), and three of foxglove.SceneUpdate: `/regions`, `/driven` (the way up to every hundredth step) and
-`/scene` (the way since then, the certified continuation). All are in the frame `map`.
+Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/decision` (specshield.Decision: the
+service's answer), and three of foxglove.SceneUpdate: `/regions`, `/driven` (the way up to the last hundredth
+step) and `/scene` (the way since then, the certified continuation). All are in the frame `map`.
 
 A viewer that jumps to a time shows the last message of each topic, and nothing of those before it. So each
 message shows all that its topic has to show.
