@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import logging
 import math
 import re
@@ -10,7 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from specshield.client import ShieldClient
+from specshield.client import AsyncShieldClient, ShieldClient
 from specshield.client.wiring import Motion, between, diagnosed
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
@@ -61,7 +63,8 @@ def told(caplog, body=the_same, frame=lambda poses: poses[-1], steps=60, seed=0)
             decision = session.step(frame(poses), [0.0] * 6 + [-20.0])
             name = decision.action_names[decision.execute]
             poses.append(moved(poses[-1], body(name, MOTIONS.get(name, (0.0, 0.0)), random)))
-    return [record.getMessage().partition(": ")[2] for record in caplog.records]
+    said = [record.getMessage().partition(": ")[2] for record in caplog.records]
+    return [each for each in said if not each.startswith("step ")]  # without the decisions' own warnings
 
 
 @pytest.mark.parametrize(
@@ -160,11 +163,43 @@ def test_the_client_of_a_server_tells_it_too(caplog, server: RunningServer):
                 decision = session.step((x, y, theta), [0.0] * 4 + [-20.0] + [0.0] * 15)
                 x, y, turned = decision.next_poses[decision.execute]
                 theta -= turned - theta
-    told = [record.getMessage() for record in caplog.records if record.name == "specshield"]
+    told = [record.getMessage() for record in caplog.records if ": step " not in record.getMessage()]
     assert [each.partition(";")[0] for each in told] == [
         f"session {session.id}: the robot turns the other way: theta and `rotate` grow counter-clockwise, "
         "on a map whose y axis points up"
     ]
+
+
+def test_a_warning_that_nobody_reads_is_logged_once_in_a_session(caplog, server: RunningServer):
+    """How many points lie outside differs from step to step; a switch changes nothing about what was said."""
+    outside, logits = [[(-9.0, -9.0)] * 2, [(-9.0, -9.0)] * 3], [0.0] * 20
+
+    async def steps_of(session, local=None):
+        for k in range(2):
+            asked = session.step((4.5, 5.0, 0.0), logits, occupied=outside[k])
+            decision = await asked if inspect.isawaitable(asked) else asked
+            switched = session.switch(local or "case1", pose=(4.5, 5.0, 0.0))
+            await switched if inspect.isawaitable(switched) else switched
+            assert any("points lie outside" in each for each in decision.warnings)
+        return session.id
+
+    async def all_clients():
+        with ShieldClient(server.url, timeout=60.0) as client:
+            yield await steps_of(client.sessions.create(policy_id="case1", initial_pose=(4.5, 5.0, 0.0)))
+        async with AsyncShieldClient(server.url, timeout=60.0) as client:
+            begun = await client.sessions.create(policy_id="case1", initial_pose=(4.5, 5.0, 0.0))
+            yield await steps_of(begun)
+        shield = LocalShield.shipped("case1")
+        yield await steps_of(shield.session(initial_pose=(4.5, 5.0, 0.0)), shield)
+
+    async def ids():
+        return [id async for id in all_clients()]
+
+    with caplog.at_level(logging.WARNING, "specshield"):
+        sessions = asyncio.run(ids())
+    told = [record.getMessage() for record in caplog.records if "outside the map" in record.getMessage()]
+    words = "2 points lie outside the map and were ignored"
+    assert told == [f"session {id}: step 0: {words}" for id in sessions]
 
 
 def test_a_motion_is_seen_from_the_robot():

@@ -25,6 +25,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
 from specshield.service.storage.store import scoped
 from specshield.service.watch.events import Watchers
+from specshield.service.watch.feed import KEPT
 from tests.service.world import ahead
 from tests.serving import HUNG, serving, wait_for
 
@@ -262,6 +263,29 @@ def test_of_many_streams_that_are_behind_one_at_a_time_reads(server, begin, step
             streams = [await watchers.open(id, -1) for _ in range(9)]
             assert await asyncio.gather(*(ids_told(stream, 2) for stream in streams)) == [[0, 1, 2]] * 9
         assert most == [1] * 9
+
+    asyncio.run(watch())
+
+
+def test_older_steps_are_read_and_written_once_for_all_streams(server, begin, step):
+    session, pose, last = begin(), ahead(1)[0], KEPT
+    for t in range(last + 1):
+        assert step(session, t, [pose]).status_code == 200
+    id, read = scoped("", session["id"]), []
+
+    async def watch():
+        async with another_server(server) as (store, watchers):
+            ask = store.news
+
+            async def news(asked):
+                read.append(asked[0][1])
+                return await ask(asked)
+
+            store.news = news
+            streams = [await watchers.open(id, -1) for _ in range(9)]
+            told = await asyncio.gather(*(ids_told(stream, last) for stream in streams))
+            assert told == [[*range(last + 1)]] * 9
+        assert read.count(0) == 1
 
     asyncio.run(watch())
 

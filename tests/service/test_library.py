@@ -16,7 +16,7 @@ import redis
 from PIL import Image
 from safetensors.numpy import load, save
 
-from specshield.errors import InsufficientStorage, NotFound
+from specshield.errors import InsufficientStorage, NotFound, StoreError
 from specshield.policy.card import policy_id
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library.claims import Claims
@@ -226,6 +226,18 @@ def test_what_cannot_be_written_is_not_claimed(claims, tmp_path, monkeypatch):
     assert claims.ids("maps", "") == []
     after = claims._store().hgetall("specshield:{library}:sums")
     assert {k: v for k, v in after.items() if v != b"0"} == {k: v for k, v in before.items() if v != b"0"}
+
+
+def test_what_cannot_be_removed_from_a_read_only_disk_is_not_deleted(claims, tmp_path, monkeypatch):
+    maps = Maps(Settings(data_dir=tmp_path), claims)
+    id = maps.add(OccupancyGrid(np.zeros((5, 6), bool), 0.3), {}, OPEN).id
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(StoreError, match="cannot be removed"):
+        maps.delete(id, "")
+    assert maps.find(id, "").id == id
+    monkeypatch.undo()
+    maps.delete(id, "")
+    assert not (tmp_path / "maps" / id).exists()
 
 
 @pytest.fixture

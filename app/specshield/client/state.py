@@ -251,7 +251,8 @@ class SessionState:
         info = build(SessionInfo, wire.json_object(reply))
         self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
         self._heard[:] = info.rules
-        self._poses, self._continuation, self._wiring = poses, Continuation(info.margin), Wiring(self.id)
+        self._poses, self._continuation = poses, Continuation(info.margin)
+        self._wiring = Wiring(self.id, self._wiring.said)
         self._stored = max(self._stored, self.t + (x_t is not None))
         return info
 

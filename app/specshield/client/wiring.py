@@ -9,6 +9,7 @@ from __future__ import annotations
 import cmath
 import logging
 import math
+import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -28,6 +29,7 @@ LONGER = (
 )
 WIDER = "the robot's turns are {:.2g} times as wide as its actions say; theta and `rotate` are in radians"
 UNTURNED = "the robot does not turn: send its new heading with each pose; or something keeps it from turning"
+NUMBERS = re.compile(r"(?<![\[,\w])\d[\d.]*")  # but not windows, by which the parts of a rule differ
 log = logging.getLogger("specshield")
 
 
@@ -48,16 +50,25 @@ class Motion(NamedTuple):
 
 
 class Wiring:
-    """What the last motions of a session led to. A mistake that they show is logged, once."""
+    """What the last motions of a session led to. A mistake that they show is logged, once; and so is each
+    warning of a decision.
 
-    def __init__(self, session: str) -> None:
-        self._session = session
+    said: the warnings that were logged, without their numbers, since these differ from step to step.
+    """
+
+    def __init__(self, session: str, said: set[str] | None = None) -> None:
+        self._session, self.said = session, set[str]() if said is None else said
         self._last: tuple[int, Pose, Decision] | None = None
         self._motions: deque[Motion] = deque(maxlen=KEPT)
         self._told = False
 
     def note(self, t: int, pose: Pose, decision: Decision, executed: bool) -> None:
         """Notes x_t [m, m, rad] and the decision there. executed: whether its `execute` will be run."""
+        for warning in decision.warnings:
+            words = NUMBERS.sub("", warning)
+            if words not in self.said:
+                self.said.add(words)
+                log.warning("session %s: step %d: %s", self._session, t, warning)
         last, self._last = self._last, (t, pose, decision) if executed else None
         if self._told or last is None or last[0] + 1 != t:
             return

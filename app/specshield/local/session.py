@@ -199,7 +199,7 @@ class LocalSession:
             any_signal=any_signal(rule.shield, seen, signals),
         )
         self._rules.append(rule)
-        self._wiring = Wiring(self.id)
+        self._wiring = Wiring(self.id, self._wiring.said)
         self._carry, self._first = carry._replace(way=way), first
         self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}

@@ -1,8 +1,11 @@
 """Writes a session as MCAP with Foxglove's schemas: map, pose and scene, and each decision as JSON.
 
-Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/scene` (foxglove.SceneUpdate: regions, the
-way driven, the certified continuation), `/decision` (specshield.Decision: the service's answer). All are in
-the frame `map`.
+Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/decision` (specshield.Decision: the
+service's answer), and three of foxglove.SceneUpdate: `/regions`, `/driven` (the way up to the last hundredth
+step) and `/scene` (the way since then, the certified continuation). All are in the frame `map`.
+
+A viewer that jumps to a time shows the last message of each topic, and nothing of those before it. So each
+message shows all that its topic has to show.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from foxglove.channels import GridChannel, PoseInFrameChannel, SceneUpdateChanne
 
 from specshield.arrays import Floats
 from specshield.drawing.outline import outlines
-from specshield.recordings.recording import Recording
+from specshield.recordings.recording import PIECE, Recording
 from specshield.world.occupancy import OccupancyGrid
 
 FRAME = "map"
@@ -45,7 +48,9 @@ def write_mcap(recording: Recording, path: Path) -> None:
     context, content = foxglove.Context(), io.BytesIO()  # foxglove raises no OSError for a file of its own
     with foxglove.open_mcap(content, context=context):
         grids, poses = GridChannel("/map", context=context), PoseInFrameChannel("/pose", context=context)
-        scenes = SceneUpdateChannel("/scene", context=context)
+        regions, driven, scenes = (
+            SceneUpdateChannel(topic, context=context) for topic in ("/regions", "/driven", "/scene")
+        )
         schema = foxglove.Schema(
             name="specshield.Decision", encoding="jsonschema", data=json.dumps(DECISION).encode()
         )
@@ -56,20 +61,26 @@ def write_mcap(recording: Recording, path: Path) -> None:
             if item.t == 0:
                 if recording.grid is not None:
                     grids.log(_grid(recording.grid, now), log_time=at)
-                scenes.log(fox.SceneUpdate(entities=_regions(recording, now)), log_time=at)
+                regions.log(fox.SceneUpdate(entities=_regions(recording, now)), log_time=at)
             poses.log(fox.PoseInFrame(timestamp=now, frame_id=FRAME, pose=_pose(*item.pose)), log_time=at)
-            driven = np.array([each.pose for each in recording.items[: item.t + 1]])
-            lines = [
-                fox.SceneEntity(timestamp=now, frame_id=FRAME, id=name, lines=[_line(way[:, :2], color)])
-                for name, way, color in (
-                    ("driven", driven, DRIVEN),
-                    ("continuation", recording.ahead(item.t), AHEAD),
-                )
-            ]
-            scenes.log(fox.SceneUpdate(entities=lines), log_time=at)
+            begun = item.t - item.t % PIECE
+            if item.t == begun:
+                driven.log(_lines(now, driven=(recording.driven(0, begun), DRIVEN)), log_time=at)
+            recent, ahead = recording.driven(begun, item.t), recording.ahead(item.t)[:, :2]
+            drawn = _lines(now, recent=(recent, DRIVEN), continuation=(ahead, AHEAD))
+            scenes.log(drawn, log_time=at)
             if item.decision is not None:
                 decisions.log(json.dumps(item.decision).encode(), log_time=at)
     path.write_bytes(content.getvalue())
+
+
+def _lines(now: fox.Timestamp, **lines: tuple[Floats, fox.Color]) -> fox.SceneUpdate:
+    return fox.SceneUpdate(
+        entities=[
+            fox.SceneEntity(timestamp=now, frame_id=FRAME, id=name, lines=[_line(way, color)])
+            for name, (way, color) in lines.items()
+        ]
+    )
 
 
 def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from specshield.client import ShieldClient
     from specshield.service.sessions.chain import Chain
 
+PIECE = 100  # [steps] of the way driven that each step writes again: with all of it, files grew too large
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -45,6 +47,10 @@ class Recording:
     def seconds(self, t: int) -> float:
         """The time of step t [s since 1970]."""
         return self.begun + t * self.step_seconds
+
+    def driven(self, first: int, last: int) -> Floats:
+        """The points [n, 2] at which the robot was from step `first`, at least 0, to step `last`."""
+        return np.array([item.pose[:2] for item in self.items[max(0, first) : last + 1]])
 
     def ahead(self, t: int) -> Floats:
         """The certified continuation at step t, as poses [n, 3] from x_t on; only x_t if there is none."""

@@ -8,7 +8,7 @@ import numpy as np
 import rerun
 
 from specshield.drawing.outline import outlines
-from specshield.recordings.recording import Recording
+from specshield.recordings.recording import PIECE, Recording
 
 
 def write_rrd(recording: Recording, path: Path) -> None:
@@ -29,10 +29,11 @@ def write_rrd(recording: Recording, path: Path) -> None:
         stream.set_time("step", sequence=item.t)
         stream.set_time("time", timestamp=recording.seconds(item.t))
         x, y, theta = item.pose
-        driven = [each.pose[:2] for each in recording.items[: item.t + 1]]
+        begun = item.t - item.t % PIECE  # a viewer shows the newest line of each piece
+        driven = recording.driven(begun - 1, item.t)
         heading = 0.3 * np.array([np.cos(theta), np.sin(theta)])
         stream.log("world/robot", rerun.Arrows2D(origins=[(x, y)], vectors=[heading]))
-        stream.log("world/driven", rerun.LineStrips2D([driven]))
+        stream.log(f"world/driven/from_{begun}", rerun.LineStrips2D([driven]))
         stream.log("world/continuation", rerun.LineStrips2D([recording.ahead(item.t)[:, :2]]))
         told = item.decision or {}
         for name in ("feasible_mass", "kl", "margin", "slack"):

@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from specshield.errors import InputError, InsufficientStorage
+from specshield.errors import InputError, InsufficientStorage, StoreError
 from specshield.service.settings import Settings
 from specshield.service.storage.objects import Folder, open_objects, unusable
 
@@ -63,6 +63,12 @@ class Kept:
         # Weights are written before the card, which makes them count.
         for name in sorted(files, key=lambda name: (name == self._mark, name.endswith(".json"), name)):
             self._objects.write(f"{id}/{name}", files[name])
+
+    def check_removable(self, id: str) -> None:
+        """Raises StoreError if the files could not be removed: they would stay, and belong to nobody."""
+        self.find(id, self._mark)
+        if not self._copies and not os.access(self.root, os.W_OK):
+            raise StoreError("the server's files cannot be removed: their folder cannot be written to")
 
     def remove(self, id: str) -> None:
         self._objects.remove(f"{id}/{self._mark}")

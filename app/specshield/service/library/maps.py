@@ -142,7 +142,7 @@ class Maps(Claimed):
             raise undeletable("map", found.name, key)
         key, token = self._id_of(key, owner), secrets.token_hex(8)
         if files.HASH.fullmatch(key):
-            self._kept.find(key, "map.json")  # raises StoreError if the files are away: they would stay
+            self._kept.check_removable(key)
         user = self.claims.mark("maps", key, owner, token)
         if user is not None:
             raise InUse(

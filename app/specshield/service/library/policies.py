@@ -234,8 +234,9 @@ class Policies(Claimed):
 
     def delete(self, record: Record, owner: str, token: str) -> bool:
         """Takes the claim of an owner whose deletion was marked with this token. True if the policy was
-        removed with it. Raises Conflict if the mark has expired.
+        removed with it. Raises Conflict if the mark has expired, StoreError for files that cannot be removed.
         """
+        self._kept.check_removable(record.id)
         last = self.claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
             self._recent.drop(record.id)

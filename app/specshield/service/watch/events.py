@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from specshield.arrays import Floats
 from specshield.errors import LimitReached, NotFound, SpecshieldError
 from specshield.service import metrics
+from specshield.service.library.files import Recent
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
@@ -34,6 +35,7 @@ HERE = 3.0  # [s] since the last decision here for which a session counts as dec
 TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and in addition for
 # each session: 0.5 s for 32. A message takes some 0.1 ms.
 PARTS = 4  # in which the sessions are looked at, so that no look delays a decision for long
+OLDER = 16  # times KEPT older steps that are kept for the streams that need the same ones: about 10 MB
 AWAY = 3.0  # [s] between two looks whether an archived session still exists
 HEARTBEAT = 15.0  # [s] without an event after which a comment is sent: less than proxies wait
 FIRST = b"retry: 1000\n\n"
@@ -53,6 +55,7 @@ class Watchers:
         self._open = 0
         # Of the streams that are behind, one at a time reads and writes older steps: that takes some ms.
         self._reading = asyncio.Lock()
+        self._older = Recent[tuple[list[Told], int]](OLDER)  # by feed and first step
 
     async def run(self) -> None:
         """Looks for news of the watched sessions until it is cancelled."""
@@ -237,6 +240,9 @@ class Watchers:
         if t >= feed.start:
             return feed.since(t), max(t, feed.end)
         await self._idle()
+        read = self._older.peek((feed, t))
+        if read is not None and feed.version:  # else the session has left the store, or was erased
+            return read
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)
@@ -246,4 +252,6 @@ class Watchers:
         elif feed.outdated(new):
             return [], t if await self._switched(feed) else feed.end
         found, end = feed.events(t, new)
+        if len(new.steps) == KEPT:
+            self._older.put((feed, t), (found, end))
         return found, end if end > t else feed.end
