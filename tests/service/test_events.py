@@ -13,8 +13,10 @@ import time
 from typing import Any
 
 import httpx
+import pytest
 import redis
 
+from specshield.errors import LimitReached
 from specshield.service.routes.sessions import _each
 from specshield.service.sessions import record
 from specshield.service.sessions.session import Session
@@ -235,6 +237,34 @@ def test_a_stream_goes_on_though_its_session_leaves_the_store_while_it_is_looked
             assert step(session, 0, ahead(0)).status_code == 200
             assert await ids_told(stream, 0) == [0]
         assert moved == [True]
+
+    asyncio.run(watch())
+
+
+def test_a_key_has_at_most_half_of_the_streams(server, begin, step):
+    session = begin()
+    assert step(session, 0, ahead(0)).status_code == 200
+
+    async def watch():
+        async with another_server(server) as (_, watchers):
+            id, streams = scoped("", session["id"]), []
+
+            async def begin_as(owner):
+                streams.append(await watchers.open(id, -1, owner))
+                await anext(streams[-1])
+
+            for _ in range(5):
+                await begin_as("one")
+            with pytest.raises(LimitReached, match="this key has 5 open streams"):
+                await begin_as("one")
+            for _ in range(5):
+                await begin_as("another")
+            with pytest.raises(LimitReached, match="this server has 10 open streams"):
+                await begin_as("third")
+            for stream in streams:
+                await stream.aclose()
+            await begin_as("one")
+            await streams[-1].aclose()
 
     asyncio.run(watch())
 

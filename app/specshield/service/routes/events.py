@@ -78,6 +78,7 @@ EVENT = {  # the schema of one event
 async def events(
     key: SessionKey,
     server: ServerState,
+    owner: Owner,
     last_event_id: Annotated[
         int | None, Header(ge=-1, le=1_000_000, description="The same as `after`; browsers send it.")
     ] = None,
@@ -92,7 +93,7 @@ async def events(
     The stream ends when the session is finished, when the caller's key is revoked, and when this server
     stops. After a stop, ask again. A caller who reads too slowly is cut off.
     """
-    stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
+    stream = await server.watchers.open(key, after if last_event_id is None else last_event_id, owner)
     return Response(status_code=204) if stream is None else EventStream(stream)
 
 
@@ -155,4 +156,4 @@ async def several(server: ServerState, owner: Owner, session: Places) -> Respons
     """
     asked = (place.partition(":") for place in session)
     after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}
-    return EventStream(await server.watchers.open_all(after))
+    return EventStream(await server.watchers.open_all(after, owner))

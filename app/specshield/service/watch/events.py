@@ -13,6 +13,7 @@ import contextlib
 import itertools
 import logging
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 
 from specshield.arrays import Floats
@@ -52,7 +53,7 @@ class Watchers:
     ) -> None:
         self._store, self._limit, self._stopping, self._deciding = store, limit, stopping, deciding
         self._feeds: dict[str, Feed] = {}
-        self._open = 0
+        self._open = Counter[str]()  # streams by owner
         # Of the streams that are behind, one at a time reads and writes older steps: that takes some ms.
         self._reading = asyncio.Lock()
         self._older = Recent[tuple[list[Told], int]](OLDER)  # by feed and first step
@@ -99,26 +100,26 @@ class Watchers:
             feed.version, feed.here = after, time.monotonic()
             feed.add(state, [each], made.t + 1, made.t + 1)
 
-    async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
+    async def open(self, id: str, after: int | None, owner: str = "") -> AsyncIterator[bytes] | None:
         """The stream of the decisions after step `after`, by default after the last decided one. None if
         there will be none. Raises NotFound, LimitReached.
         """
-        self._check_room()
+        self._check_room(owner)
         feed = self._feeds.get(id) or await self._begin(id)
         t = feed.end if after is None else after + 1
-        return None if feed.over and t >= feed.end else self._stream({feed: t}, several=False)
+        return None if feed.over and t >= feed.end else self._stream({feed: t}, owner, several=False)
 
-    async def open_all(self, after: Mapping[str, int | None]) -> AsyncIterator[bytes]:
+    async def open_all(self, after: Mapping[str, int | None], owner: str = "") -> AsyncIterator[bytes]:
         """One stream of the decisions of several sessions, each after its own step. Sessions that do not
         exist are left out. Raises LimitReached.
         """
-        self._check_room()
+        self._check_room(owner)
         places = {}
         for id, t in after.items():
             with contextlib.suppress(NotFound):
                 feed = self._feeds.get(id) or await self._begin(id)
                 places[feed] = feed.end if t is None else t + 1
-        return self._stream(places, several=True)
+        return self._stream(places, owner, several=True)
 
     async def _idle(self) -> None:
         """Waits a little while steps are being decided here."""
@@ -127,18 +128,24 @@ class Watchers:
                 return
             await asyncio.sleep(MOMENT)
 
-    def _check_room(self) -> None:
-        if self._open >= self._limit:
-            raise LimitReached(
-                f"this server has {self._limit} open streams of events",
-                expected="room for one more: close one, or ask another server",
-            )
+    def _check_room(self, owner: str) -> None:
+        """Raises LimitReached if there is no room for one more stream. The owner of an API key may have half
+        of them, so that nobody keeps all others from watching.
+        """
+        own, whose = self._open[owner], f"this server has {self._limit}"
+        if owner and own >= max(self._limit // 2, 1):
+            whose = f"this key has {own}"
+        elif self._open.total() < self._limit:
+            return
+        raise LimitReached(
+            f"{whose} open streams of events", expected="room for one more: close one, or ask another server"
+        )
 
-    async def _stream(self, after: Mapping[Feed, int], several: bool) -> AsyncIterator[bytes]:
+    async def _stream(self, after: Mapping[Feed, int], owner: str, several: bool) -> AsyncIterator[bytes]:
         """Serves one session at once, and `several` sessions from time to time with all their events."""
         places = {self._feeds.setdefault(feed.id, feed): t for feed, t in after.items()}
         feeds, told_at = list(places), time.monotonic()
-        with self._watching(feeds):
+        with self._watching(feeds, owner):
             yield FIRST
             while places and not self._stopping():
                 told, changed = [], feeds[0].changed
@@ -162,16 +169,16 @@ class Watchers:
                         await asyncio.wait_for(changed.wait(), HEARTBEAT)
 
     @contextlib.contextmanager
-    def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
+    def _watching(self, feeds: Sequence[Feed], owner: str) -> Iterator[None]:
         for feed in feeds:
             feed.watchers += 1
-        self._open += 1
+        self._open[owner] += 1
         metrics.watchers.inc()
         try:
             yield
         finally:
             metrics.watchers.dec()
-            self._open -= 1
+            self._open[owner] -= 1
             for feed in feeds:
                 feed.watchers -= 1
                 if not feed.watchers and self._feeds.get(feed.id) is feed:
