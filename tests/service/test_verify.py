@@ -151,7 +151,7 @@ def test_a_result_that_cannot_be_printed_is_not_that_of_a_record_that_differs(ca
     file.write_bytes(case1[0])
     for asked, status, said in (
         (["verify", str(file)], 3, "the result cannot be printed"),
-        (["openapi"], 1, "what this command writes is not complete"),
+        (["openapi"], 2, "what this command writes is not complete"),
     ):
         command = Forked(asked, {**os.environ}, stdout=Path("/dev/full"), stderr=told, cwd=tmp_path)
         assert command.wait(HUNG) == status
