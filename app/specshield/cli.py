@@ -51,8 +51,8 @@ def _about(
 
 
 def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
-    """Runs a command line with these commands. Expected errors are shown in one line. After an error of any
-    kind the exit status is FAILED: by 1, a command says that it worked and what it looked at is not well.
+    """Runs a command line with these commands. Expected errors are shown in one line. After any error the
+    exit status is FAILED. A command that worked ends with 1 if what it looked at is not well: a broken rule.
 
     options: of the `typer.Typer`.
     """
