@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import itertools
 import json
 import os
@@ -20,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import IO
 
 import httpx
 import psutil
@@ -110,18 +112,28 @@ HUNG = 900.0
 _PORTS = itertools.cycle(random.SystemRandom().sample(range(20_000, 32_000), 12_000))
 
 
-def free_port() -> int:
-    """A port that is free now, and that this process does not hand out again for a long time.
+@cache
+def _handed_out() -> IO[bytes]:
+    """A file of which byte P is locked, to its end, by the process of tests that has handed out port P.
 
-    The kernel's own choice (port 0) may be the same twice before the first is in use, and may be taken by
-    an outgoing connection of another test meanwhile.
+    It is opened once: to close any handle of it would give up all locks of this process.
+    """
+    return open(Path(tempfile.gettempdir(), f"specshield-test-ports-{os.getuid()}"), "ab")
+
+
+def free_port() -> int:
+    """A port that is free now, and that no process of tests hands out again while this one runs.
+
+    To find a port free is not enough: a server takes a second to listen, and the tests of another process
+    may find the same one free meanwhile. The kernel's own choice (port 0) may be the same twice before the
+    first is in use, and may be taken by an outgoing connection of another test.
     """
     for port in itertools.islice(_PORTS, 12_000):
-        with socket.socket() as probe:
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            fcntl.lockf(_handed_out(), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, port)
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            with contextlib.suppress(OSError):
-                probe.bind(("127.0.0.1", port))
-                return port
+            probe.bind(("127.0.0.1", port))
+            return port
     raise OSError("no port from 20000 to 31999 is free")
 
 
