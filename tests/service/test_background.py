@@ -24,6 +24,17 @@ def test_calls_are_made_in_turn_and_their_errors_are_told():
         wrong.result()
 
 
+def test_owners_take_turns():
+    background, before, order = Background("test"), Future[int](), []
+    background.submit(before.result)
+    asked = ("many", 1), ("many", 2), ("many", 3), ("few", 4)
+    calls = [background.submit(order.append, number, owner=owner) for owner, number in asked]
+    before.set_result(1)
+    for each in calls:
+        each.result(HUNG)
+    assert order == [1, 4, 2, 3]
+
+
 def test_a_task_of_the_server_that_fails_is_told_in_the_log_and_begun_again(caplog, monkeypatch):
     begun = []
 

@@ -18,11 +18,11 @@ def test_a_session_goes_on_without_tables_that_cannot_be_made_and_does_not_try_a
     nowhere = np.array([shield.task.grid.occupied.size])  # no cell of the map
     for cells in (nowhere, nowhere + 1):
         known = LearnedMap(1, cells, np.array([True]), np.array([0]), np.array([0]))
-        assert tables.of("a session", shield, known) == (shield, None)
+        assert tables.of("a session", shield, known, "") == (shield, None)
         _, made = begun = tables._last.peek("a session")
         wait_for(made.done)
         for _ in range(2):
-            assert tables.of("a session", shield, known) == (shield, None)
+            assert tables.of("a session", shield, known, "") == (shield, None)
             assert tables._last.peek("a session") == begun
 
 
@@ -35,8 +35,8 @@ def test_a_step_does_without_tables_while_no_thread_can_be_started(monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", none_left)
-        assert tables.of("a session", shield, known) == (shield, None)
-    wait_for(lambda: tables.of("a session", shield, known)[1] == known.digest)
+        assert tables.of("a session", shield, known, "") == (shield, None)
+    wait_for(lambda: tables.of("a session", shield, known, "")[1] == known.digest)
 
 
 def test_tables_take_no_more_memory_than_they_may_and_are_not_made_in_circles(monkeypatch):
@@ -49,7 +49,7 @@ def test_tables_take_no_more_memory_than_they_may_and_are_not_made_in_circles(mo
     tables, sessions = Tables(), [f"session {i}" for i in range(4)]
 
     def ask(session):
-        return tables.of(session, shield, known)[1]
+        return tables.of(session, shield, known, "")[1]
 
     for session in sessions:
         assert ask(session) is None

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from queue import SimpleQueue
-from threading import Lock, Thread
+from threading import Lock, Semaphore, Thread
 from typing import TypeVar
 
 T = TypeVar("T")
 
 
 class Background:
-    """Like an executor with one thread, but the interpreter does not wait for the thread at its end."""
+    """Like an executor with one thread, but the interpreter does not wait for the thread at its end.
+
+    Owners take turns: if one asks for a hundred calls, another owner's next call waits for one of them.
+    """
 
     def __init__(self, name: str) -> None:
-        self._name, self._calls, self._lock = name, SimpleQueue[Callable[[], None]](), Lock()
+        self._name, self._lock, self._waiting = name, Lock(), Semaphore(0)
+        self._lines: OrderedDict[str, deque[Callable[[], None]]] = OrderedDict()
         self._thread: Thread | None = None
 
-    def submit(self, function: Callable[..., T], *args: object) -> Future[T]:
+    def submit(self, function: Callable[..., T], *args: object, owner: str = "") -> Future[T]:
         future = Future[T]()
 
         def call() -> None:
@@ -34,9 +38,20 @@ class Background:
                 thread = Thread(target=self._run, name=self._name, daemon=True)
                 thread.start()  # may fail; the next call then tries again
                 self._thread = thread
-        self._calls.put(call)
+            self._lines.setdefault(owner, deque()).append(call)
+        self._waiting.release()
         return future
 
     def _run(self) -> None:
         while True:
-            self._calls.get()()
+            self._waiting.acquire()
+            self._next()()
+
+    def _next(self) -> Callable[[], None]:
+        """The oldest call of the owner that had a turn longest ago."""
+        with self._lock:
+            owner, line = self._lines.popitem(last=False)
+            call = line.popleft()
+            if line:
+                self._lines[owner] = line
+            return call

@@ -46,9 +46,9 @@ class Made(NamedTuple):
 
 
 class Tables:
-    """The newest tables of each session. One thread makes them, for one session at a time; kernels run
-    without the interpreter's lock. If too many sessions have tables, those that were used longest ago are let
-    go, and made again once their sessions learn something new.
+    """The newest tables of each session. One thread makes them, for one session at a time, and owners take
+    turns; kernels run without the interpreter's lock. If too many sessions have tables, those that were used
+    longest ago are let go, and made again once their sessions learn something new.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Tables:
         # By session: the map and the policies that its tables were last begun for, and whether they are done.
         self._last = files.Recent[tuple[object, Future[None]]](SESSIONS)
 
-    def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
+    def of(self, session: str, shield: Shield, known: LearnedMap, owner: str) -> tuple[Shield, bytes | None]:
         """The shield with the newest tables of the session, and their digest, None if it has none yet. Also
         begins to make the tables for `known`, unless others of the session are being made.
 
@@ -68,7 +68,8 @@ class Tables:
         wanted, last = (known.digest, _ids(shield)), self._last.peek(session)
         if last is None or (last[0] != wanted and last[1].done()):
             with suppress(RuntimeError):  # no thread can be started just now: the next step tries again
-                self._last.put(session, (wanted, self._threads.submit(self._make, session, shield, known)))
+                made = self._threads.submit(self._make, session, shield, known, owner=owner)
+                self._last.put(session, (wanted, made))
         newest = self._newest.peek(session)
         if newest is None or newest.policies != _ids(shield):  # of an earlier rule
             return shield, None

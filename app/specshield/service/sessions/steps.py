@@ -232,6 +232,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    shield, tables = shields.tables.of(session.rule.nonce, shield, state.learned)
+    shield, tables = shields.tables.of(session.rule.nonce, shield, state.learned, session.rule.owner)
     before, since = record.link(state.head, session.rows[state.next_t :]), session.since
     return Decided(session, *decide(shield, asked, request.t, since, names, state.carry, before, tables))
