@@ -19,7 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specshield.errors import BodyTooLarge, Busy, InputError, RequestTimeout, SpecshieldError
 from specshield.service import problems
-from specshield.service.access.site import UPLOADS
+from specshield.service.access.site import UPLOADS, WITH_BODY
 from specshield.service.bounds.protocol import ARRIVED, FREE
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings
@@ -111,19 +111,24 @@ class Bodies:
         self._folder, self._short = settings.data_dir / "incoming", min(settings.max_body_bytes, LONG_JSON)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or not _has_body(scope):
+        headers = dict[bytes, bytes](scope.get("headers", ()))
+        framed = b"content-length" in headers or b"transfer-encoding" in headers
+        if scope["type"] != "http" or not (framed or scope["method"] in WITH_BODY):
             await self.app(scope, receive, send)
             return
         path = scope["path"].rstrip("/")
         upload = path in UPLOADS
-        announced = _header(scope, b"content-length")
+        announced = headers.get(b"content-length", b"")
         if ARRIVED in scope["state"] and not upload and announced.isdigit() and int(announced) <= self._short:
             await self._pass_on(scope, receive, send)  # nearly every step: too short for the limits below
             return
-        body = Body(self._budget, self._folder, _header(scope, b"content-type"))
+        body = Body(self._budget, self._folder, headers.get(b"content-type", b"").decode("latin-1"))
         try:
             try:
-                if not await self._take_in(scope, receive, body, self._limit(path)):
+                limit = self._limit(path)
+                if announced.isdigit() and int(announced) > limit:
+                    raise _too_large(limit)
+                if not await self._take_in(receive, body, limit):
                     scope["state"]["status"] = CLIENT_GONE
                     return
                 if not upload:
@@ -156,11 +161,8 @@ class Bodies:
         most = self._settings.max_body_bytes
         return most if path.endswith(LONG) else min(most, FREE)
 
-    async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
+    async def _take_in(self, receive: Receive, body: Body, limit: int) -> bool:
         """Receives a body of at most `limit` bytes. False if the client has left."""
-        announced = _header(scope, b"content-length") or "0"
-        if announced.isdigit() and int(announced) > limit:
-            raise _too_large(limit)
         loop, patience = asyncio.get_running_loop(), self._settings.request_timeout
         begun, slowest = loop.time(), self._settings.min_body_rate
         try:
@@ -234,13 +236,3 @@ def _replay(content: bytes | Path, receive: Receive) -> Receive:
         return {"type": "http.request", "body": whole, "more_body": False}
 
     return replay
-
-
-def _has_body(scope: Scope) -> bool:
-    return scope["method"] in ("POST", "PUT", "PATCH") or any(
-        name in (b"content-length", b"transfer-encoding") for name, _ in scope["headers"]
-    )
-
-
-def _header(scope: Scope, wanted: bytes) -> str:
-    return next((value.decode("latin-1") for name, value in scope["headers"] if name == wanted), "")
