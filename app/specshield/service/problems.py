@@ -290,8 +290,12 @@ def install(app: FastAPI) -> None:
     from fastapi.exceptions import RequestValidationError  # the processes for heavy work need no FastAPI
 
     @app.exception_handler(SpecshieldError)
-    async def ours(request: Request, error: SpecshieldError) -> Response:
-        return tell(request.scope, error)
+    @app.exception_handler(OSError)
+    @app.exception_handler(RuntimeError)
+    async def foreseen(request: Request, error: Exception) -> Response:
+        if (told := known(error)) is None:
+            raise error
+        return tell(request.scope, told)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
@@ -319,13 +323,6 @@ def install(app: FastAPI) -> None:
     async def gone(request: Request, error: Exception) -> Response:
         request.scope["state"]["status"] = CLIENT_GONE
         return Response(status_code=CLIENT_GONE)  # nobody reads it
-
-    @app.exception_handler(OSError)
-    @app.exception_handler(RuntimeError)
-    async def passing(request: Request, error: Exception) -> Response:
-        if (told := known(error)) is None:
-            raise error
-        return tell(request.scope, told)
 
     @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:
