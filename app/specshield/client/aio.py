@@ -17,7 +17,7 @@ from specshield.client.core import D, Feed, Flow, More, T, Wait, page_of
 from specshield.client.models import Decision, Page
 from specshield.client.network import bounded
 from specshield.client.network.stream import AsyncStreams, packed
-from specshield.client.network.transport import Exchange, address, headers
+from specshield.client.network.transport import LATE, Exchange, address, headers
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.wire import Failure, Reply, Request, seconds_value
@@ -85,9 +85,7 @@ class AsyncShieldClient:
         bounded.ENDS.set(exchange.ends)
         try:
             return await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())
-        except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
-            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
-        except httpx.RequestError as error:
+        except (*LATE, httpx.RequestError) as error:
             return exchange.failure(error)
 
     async def _exchanged(self, exchange: Exchange) -> Reply | Failure:
@@ -111,7 +109,7 @@ class AsyncShieldClient:
         bounded.ENDS.set(more.ends)
         try:
             piece: bytes = await asyncio.wait_for(anext(more.feed.pieces, b""), more.ends - time.monotonic())
-        except (asyncio.TimeoutError, TimeoutError, httpx.RequestError):
+        except (*LATE, httpx.RequestError):
             piece = b""
         if not piece:
             await more.feed.close()

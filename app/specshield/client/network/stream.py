@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import httpx
 
 from specshield.client.network.bounded import in_thread, is_direct
-from specshield.client.network.transport import MINE, STALE, Exchange
+from specshield.client.network.transport import LATE, MINE, STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
 
@@ -125,7 +125,7 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
     """The outcome of a try whose connection failed. An HTTP answer may have refused the handshake."""
     answer = getattr(error, "response", None)
     if answer is None:
-        return exchange.failure(httpx.ReadError(str(error)))
+        return exchange.failure(error)
     exchange.content += answer.body or b""
     # The handshake sends no id of its own, so any that came back is another's invention.
     headers = {name: value for name, value in answer.headers.raw_items() if name.lower() != MINE.lower()}
@@ -147,11 +147,7 @@ class SyncStreams(Streams):
             connection.send(message)
             reply = self._read(exchange, connection.recv(max(exchange.ends - time.monotonic(), 0.0)))
             return reply
-        except TimeoutError:
-            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
-        except httpx.RequestError as error:
-            return exchange.failure(error)
-        except (websockets.WebSocketException, OSError, UnicodeError) as error:
+        except (httpx.RequestError, websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
         finally:
             self._keep(connection, path, reply)
@@ -180,11 +176,7 @@ class AsyncStreams(Streams):
         try:
             seconds = max(exchange.ends - time.monotonic(), 0.0)
             return await asyncio.wait_for(self._asked(exchange, message), seconds)
-        except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
-            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
-        except httpx.RequestError as error:
-            return exchange.failure(error)
-        except (websockets.WebSocketException, OSError, UnicodeError) as error:
+        except (*LATE, httpx.RequestError, websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
 
     async def _asked(self, exchange: Exchange, message: bytes) -> Reply | Failure:

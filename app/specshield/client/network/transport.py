@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import secrets
 import time
@@ -19,6 +20,7 @@ MOST_PREPARED = 1 << 30  # [bytes] of the answer of a slow request, such as a lo
 UNDERSTANDING = 1e-7  # [s] kept for parsing each byte; json.loads of a step's answer took 55 ns a byte
 STALE = "the answer belongs to another request"
 MINE = "X-Request-Id"  # the server sends back what it was sent
+LATE = (TimeoutError, asyncio.TimeoutError)  # one and the same from Python 3.11 on
 
 
 def address(base_url: str) -> httpx.URL:
@@ -106,8 +108,12 @@ class Exchange:
         now = time.monotonic()
         return now - self.began, self._allowed, self._ends - now
 
-    def failure(self, error: httpx.RequestError) -> Failure:
-        """The TransportError for any failure of httpx, whose error is the cause."""
+    def failure(self, error: Exception) -> Failure:
+        """The TransportError for any failure of a connection. Its cause is httpx's error for that."""
+        if isinstance(error, LATE):
+            error = httpx.ReadTimeout("the time of this try is over")
+        elif not isinstance(error, httpx.RequestError):
+            error = httpx.ReadError(str(error))
         what = f"{self.request.method} {str(self._base_url).rstrip('/')}{self.request.path}"
         mapped: TransportError
         if isinstance(error, httpx.TimeoutException):
