@@ -56,11 +56,11 @@ class Observe:
         try:
             await self.app(scope, receive, answer)
         except Exception as error:
-            told = problems.known(error)
-            if not begun:
+            told, late = problems.known(error), begun
+            if not late:
                 response = problems.failed() if told is None else problems.tell(scope, told)
                 await response(scope, receive, answer)
-            if begun or told is None:
+            if late or told is None:
                 raise
         finally:
             status = scope["state"].get("status", status)  # set if the caller has left

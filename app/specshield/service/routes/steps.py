@@ -35,13 +35,16 @@ STEPS = re.compile(rf"/v1/sessions/({ID})/steps")
 STREAM = re.compile(rf"/v1/sessions/({ID})/stream")
 STEPS_ROUTE = SimpleNamespace(path="/v1/sessions/{session_id}/steps")  # what the metrics call it
 STREAM_ROUTE = "/v1/sessions/{session_id}/stream"
+UPGRADE = "Upgrade: websocket, which a proxy in front of the server has to pass on, and Connection"
 PACKED, JSON = MSGPACK.encode(), b"application/json"
 GOING_AWAY, REFUSED = 1001, 1008  # codes of RFC 6455: the server stops; a policy of the server is violated
 log = logging.getLogger("specshield")
 
 
 class StepRoutes:
-    """Answers the steps and the streams, and passes everything else on to `app`."""
+    """Answers the steps and the streams, and passes everything else on to `app`. Errors of requests are
+    answered by middleware.py.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
@@ -53,7 +56,9 @@ class StepRoutes:
             await _answer_step(scope, receive, send)
         elif kind in ("http", "websocket") and (found := STREAM.fullmatch(scope["path"])):
             scope["path_params"] = {"session_id": found[1]}
-            await (_serve_stream if kind == "websocket" else _refuse_stream)(scope, receive, send)
+            if kind == "http":
+                raise InputError("this opens no WebSocket", path="Upgrade", expected=UPGRADE)
+            await _serve_stream(scope, receive, send)
         else:
             await self.app(scope, receive, send)
 
@@ -62,14 +67,10 @@ async def _answer_step(scope: Scope, receive: Receive, send: Send) -> None:
     scope["route"] = STEPS_ROUTE
     headers = dict(scope["headers"])
     body = (await receive())["body"]  # the whole body: bounds/bodies.py has waited for it
-    try:
-        packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
-        request = read_step(body, packed)
-        server: Server = scope["app"].state.server
-        answer = await server.sessions.steps.decide(_key(scope), request, scope["state"]["timing"])
-    except SpecshieldError as error:
-        await problems.tell(scope, error)(scope, receive, send)
-        return
+    packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
+    request = read_step(body, packed)
+    server: Server = scope["app"].state.server
+    answer = await server.sessions.steps.decide(_key(scope), request, scope["state"]["timing"])
     packed = accepts(headers.get(b"accept", b"").decode("latin-1"), MSGPACK)
     content = to_msgpack(answer) if packed else to_json(answer)
     told = [(b"content-length", b"%d" % len(content)), (b"content-type", PACKED if packed else JSON)]
@@ -79,12 +80,6 @@ async def _answer_step(scope: Scope, receive: Receive, send: Send) -> None:
 
 def _key(scope: Scope) -> str:
     return scoped(scope["state"]["owner"], scope["path_params"]["session_id"])
-
-
-async def _refuse_stream(scope: Scope, receive: Receive, send: Send) -> None:
-    expected = "Upgrade: websocket, which a proxy in front of the server has to pass on, and Connection"
-    error = InputError("this opens no WebSocket", path="Upgrade", expected=expected)
-    await problems.ProblemResponse(error)(scope, receive, send)
 
 
 async def _serve_stream(scope: Scope, receive: Receive, send: Send) -> None:
