@@ -111,7 +111,7 @@ class Bodies:
         self._folder, self._short = settings.data_dir / "incoming", min(settings.max_body_bytes, LONG_JSON)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = dict[bytes, bytes](scope.get("headers", ()))
+        headers: dict[bytes, bytes] = dict(scope.get("headers", ()))
         framed = b"content-length" in headers or b"transfer-encoding" in headers
         if scope["type"] != "http" or not (framed or scope["method"] in WITH_BODY):
             await self.app(scope, receive, send)
