@@ -1,9 +1,11 @@
 """A server on a machine that has no threads left for it."""
 
+import asyncio
 import os
 
 import httpx
 
+from specshield.service.middleware import Observe
 from tests.service.test_sessions import problem
 from tests.serving import serving
 
@@ -38,3 +40,18 @@ def test_who_needs_a_thread_that_cannot_be_started_is_told_to_ask_again(tmp_path
         flag.unlink()
         assert all(client.get(path).status_code == 200 for path in paths)
     assert "Traceback" not in server.log.read_text()
+
+
+def test_who_was_told_to_ask_again_keeps_the_connection_and_no_traceback_is_written():
+    """An error that is raised once more after its answer makes uvicorn do both; a step's was."""
+    sent = []
+
+    async def step(scope, receive, send):
+        raise RuntimeError("can't start new thread")
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "method": "POST", "path": "/v1/sessions/a/steps", "headers": []}
+    asyncio.run(Observe(step)(scope, None, send))
+    assert [message.get("status") for message in sent] == [503, None]
