@@ -81,11 +81,11 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
         list(servers.map(lambda _: check_files(embedded.url, shared, 10.0), range(8)))
     check_files(embedded.url, shared, 10.0)
 
-    def told(command: str) -> subprocess.CompletedProcess[str]:
-        return run_specshield(command, REDIS_URL=embedded.url, SPECSHIELD_DATA_DIR=other)
+    def told(*words: str) -> subprocess.CompletedProcess[str]:
+        return run_specshield(*words, REDIS_URL=embedded.url, SPECSHIELD_DATA_DIR=other)
 
     with ThreadPoolExecutor(2) as several:  # each waits for 5 s, in case that the file is only just written
-        started = [several.submit(told, command) for command in ("serve", "worker")]
+        started = [several.submit(told, *words) for words in (("serve", "--port", "0"), ("worker",))]
         with pytest.raises(InputError, match="SPECSHIELD_DATA_URL"):
             check_files(embedded.url, other, 10.0)
     for each in started:
