@@ -26,7 +26,7 @@ def evaluate(
             help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps; NAME@conformal/K: a "
             "margin that 60 other runs measure; NAME@default: as a session is by default; "
             "NAME@episode/D, NAME@default/D: threshold D over the episode; "
-            "NAME@step/D: at each step; NAME@robustness/D: of D metres, with J = rho."
+            "NAME@step/D: at each step; NAME@robustness/D: of D metres of robustness."
         ),
     ] = "",
     noise: Annotated[
@@ -98,7 +98,7 @@ def worlds(
     out: Annotated[Path | None, typer.Option(help="Folder to keep runs in and to take them up from.")] = None,
     processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
 ) -> None:
-    """Measure what a session keeps in worlds that are not as it was told, beside an oracle that was."""
+    """Measure how often sessions keep the rule in worlds other than told, beside an oracle told the truth."""
     from evaluation.worlds.campaign import compare
     from evaluation.worlds.robots import ROBOTS
     from evaluation.worlds.runs import SENSING, Trial, known
@@ -178,7 +178,7 @@ def rewards(
     case: Annotated[str, typer.Option(help="Cases, as 1,2.")] = "1,2",
     reward: Annotated[str, typer.Option(help="Some of paper, progress.")] = "paper,progress",
     seeds: Annotated[str, typer.Option(help="Seeds of the trainings, as 0,1,2.")] = "0,1,2",
-    updates: Annotated[int, typer.Option(help="Of each training; 16000 is the default of `train`.")] = 16_000,
+    updates: Annotated[int, typer.Option(help="Updates of each training; `train` makes 16000.")] = 16_000,
     runs: Annotated[int, typer.Option(help="Runs by the paper's rule with each network.", min=1)] = 50,
     out: Annotated[
         Path, typer.Option(help="Folder of the networks; what it holds is not made again.")
@@ -206,9 +206,9 @@ def curves(
     case: Annotated[str, typer.Option(help="Cases, as 1,2.")] = "1,2",
     model: Annotated[str, typer.Option(help="Models, as learned,goal-seeker.")] = "learned,unsteered",
     thresholds: Annotated[
-        str, typer.Option(help="Of each step and of the episode, above 0 and at most 1.")
+        str, typer.Option(help="Thresholds, each used over a step and over the episode; above 0, at most 1.")
     ] = "0.25,0.5,0.75,0.9,1",
-    metres: Annotated[str, typer.Option(help="Thresholds with J = rho, in metres.")] = "-0.5,0,0.1,0.2",
+    metres: Annotated[str, typer.Option(help="Thresholds on the robustness, in metres.")] = "-0.5,0,0.1,0.2",
     runs: Annotated[int, typer.Option(help="Runs of each point.", min=1)] = 60,
     seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(
@@ -219,7 +219,7 @@ def curves(
     ),
     processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
 ) -> None:
-    """Measure what thresholds below 1 and a real-valued J keep, and what they cost."""
+    """Measure how often thresholds below 1, or in metres, keep the rule, and what they cost."""
     from evaluation.curves import draw_all
     from evaluation.experiment import Experiment
     from specshield.sim.cases import case_name

@@ -65,8 +65,8 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
     if kernels.is_dir():
         os.environ.setdefault("NUMBA_CACHE_DIR", str(kernels))
     app = typer.Typer(
-        help="Keeps robot foundation models inside their operating rules.",
-        epilog="More commands, such as evaluate, come with evaluation/, from a clone: make install.",
+        help="Makes a robot keep the rules that you write, while a model of yours drives it.",
+        epilog="In a clone, `make install` adds further commands, such as evaluate.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         **options,
@@ -192,7 +192,7 @@ def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
     learner: Annotated[bool, typer.Option(help="Only methods that learn.", hidden=True)] = False,
 ) -> None:
-    """Make the policies that are asked for, until stopped. Methods that learn need torch.
+    """Make the policies that a server is asked for, until stopped. Methods that learn need torch.
 
     Other packages may have jobs too: each entry point of the group specshield.queues has the name of a queue
     of jobs.
@@ -217,11 +217,11 @@ def verify(
         Path | None, typer.Option(help="A folder of maps; by default those that come with specshield.")
     ] = None,
 ) -> None:
-    """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
+    """Check a session's record: its chain of hashes, and each decision, which is made again and compared.
 
-    The exit status is 0 if nothing differs, 1 if something does, 2 if only the chain could be checked, as map
-    or policy are missing, 3 if the file cannot be read or the result not be printed, 4 if a step differs
-    that another version decided.
+    The exit status is 0 if nothing differs, 1 if something does, 2 if only the chain could be checked because
+    the map or a policy is missing, 3 if the file cannot be read or the result cannot be printed, and 4 if a
+    step differs that another version of specshield decided.
     """
     from specshield.service import verify as verifying
     from specshield.service.settings import read_settings
@@ -259,7 +259,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
     stay: Annotated[bool, typer.Option("--open", help="Keep the service and its page running.")] = False,
 ) -> None:
-    """Run the paper's two cases with and without the shield; print a table and draw a picture of each."""
+    """Drive a simulated robot in two cases, with and without the shield; print a table and draw pictures."""
     from specshield.sim.demo import run_demo
 
     raise typer.Exit(run_demo(runs, seed, out, stay))

@@ -13,7 +13,7 @@ from specshield.errors import SpecshieldError
 def check_drive(
     bag: Annotated[Path, typer.Argument(help="A rosbag2: its folder.", show_default=False)],
     policy: Annotated[
-        str, typer.Option(help="One that came with specshield, or a folder by LocalShield.save.")
+        str, typer.Option(help="A policy that came with specshield, or a folder of LocalShield.save.")
     ],
     step_seconds: Annotated[
         float,
