@@ -2,19 +2,19 @@
 
 SpecshieldError
 ├── InputError                  what the caller gave is wrong; nothing was changed
-│   ├── FormulaError            STL text that does not parse, or names nothing declares
+│   ├── FormulaError            STL text that does not parse, or has names that are not declared
 │   │   └── HorizonError        a horizon over the limit
-│   ├── FragmentError           a formula outside what a policy can be made for
+│   ├── FragmentError           a formula of a form that the policy's method or look-ahead does not take
 │   ├── SampleError             samples or signals that are missing, too short, NaN or infinite
 │   ├── MapError                a map, house or region that cannot be read
 │   ├── RobotError              an unknown or impossible robot
 │   ├── PoseError               a pose outside the map, in collision, or not finite
 │   ├── LogitsError             wrong number, NaN, +inf or all null
 │   ├── PolicyError             weights or a card that do not fit their task
-│   ├── InfeasibleStart         no action from the initial pose has a satisfying future
-│   ├── InfeasibleSwitch        no action from here has a future that satisfies the new rule
-│   ├── Unsupported             a known thing that cannot be had here
-│   ├── TooExpensive            it took more time or memory than the server gives to one request
+│   ├── InfeasibleStart         no way to keep the rule was found from the initial pose
+│   ├── InfeasibleSwitch        no way to keep the new rule was found from the robot's pose
+│   ├── Unsupported             something that cannot be had on this server or for this task
+│   ├── TooExpensive            a request that took more time or memory than one request may take
 │   ├── HeadersTooLarge         request headers over the limit
 │   ├── BodyTooLarge            a request body over the limit
 │   └── UnsupportedMediaType    a body that is not declared as a type that is taken
@@ -31,14 +31,14 @@ SpecshieldError
 ├── Unauthorized                a missing or wrong API key
 ├── CrossSite                   a request that a page of another origin made
 ├── MisdirectedRequest          a Host that is not this server's
-├── LimitReached                too many maps, policies or sessions kept; delete some
+├── LimitReached                too many maps, policies, sessions or the like; delete some
 │   └── RateLimited             too many requests a second for this key; ask again after Retry-After
 ├── InsufficientStorage         no room on the disk, or none left for this owner
 ├── Busy                        the server has too much to do just now; ask again after Retry-After
 ├── RequestTimeout              the request took too long to arrive
 ├── TrainingUnavailable         no worker is there to train
 ├── Starting                    the server is not ready yet; ask again after Retry-After
-├── Stopping                    the server is about to stop; it goes on with what it is asked until then
+├── Stopping                    the server is about to stop; until then it still does what it is asked
 ├── StoreError                  the trajectory store cannot be reached
 ├── ServerError                 the server failed; what it knows is in its log
 └── TransportError              the client could not reach the server
