@@ -30,7 +30,7 @@ READY_EVERY = 0.25  # [s] between two requests whether the server is ready
 def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     """Return when the server is ready to decide: its first start takes about a minute.
 
-    This also waits for a server that cannot be reached yet. A warning is logged of what it waits for. Raises
+    This also waits for a server that cannot be reached yet. A logged warning says for what. Raises
     TransportTimeout after `timeout` [s], with the progress of the server's start.
     """
     if timeout not in (0.0, math.inf):  # to ask once, or for ever
@@ -240,19 +240,19 @@ def create_session(
     threshold_over: Literal["step", "episode"] = "step",
     on_failure: OnFailure = "raise",
 ) -> Flow[SessionInfo]:
-    """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
+    """Begin a session at `initial_pose`, with which the first step's pose has to agree to 1e-6.
 
-    `threshold` is delta. The guarantee holds for 1 with evaluation "feasibility", the defaults. With
-    evaluation "robustness" it is the mean robustness [m] to reach, for which 1 is often too much. `margin`
-    and `slack` are the robustness [m] and the steps to keep in reserve. `shaping` is "projection" or one of
-    the preferences that the server's /docs lists. Raises InfeasibleStart if no action has a satisfying
-    future, unless `allow_infeasible`.
+    `threshold` is the least probability of the actions that can keep the rule. The guarantee holds for 1 with
+    evaluation "feasibility", the defaults. With evaluation "robustness" it is the mean robustness [m] to
+    reach, for which 1 is often too much. `margin` and `slack` are the robustness [m] and the steps to keep in
+    reserve. `shaping` is "projection" or one of the preferences that the server's /docs lists. Raises
+    InfeasibleStart if no way to keep the rule was found, unless `allow_infeasible`.
 
     `uncertainty`: with "learned", margin and slack follow from how the robot moves; {"translation": m,
     "rotation": rad, "slip": probability} is what is known of it before the first step; with "none", it is
     taken to move exactly as described. `learn_map`: a motion that stops short marks what it ran into.
-    `map_memory`: the steps after which a point sent as `occupied` is forgotten; None: it is not forgotten for
-    its age. `threshold_over`: whether `threshold` holds at each "step" or over the whole "episode".
+    `map_memory`: the steps after which a point sent as `occupied` is forgotten; None: its age does not
+    matter. `threshold_over`: whether `threshold` holds at each "step" or over the whole "episode".
 
     `on_failure` says what `step` does when the service cannot answer in time. "raise": it raises the error.
     "witness": it returns a `LocalDecision` that follows the latest certified continuation, or says to stop if

@@ -45,8 +45,8 @@ class Map:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy pi_phi. progress: in [0, 1]. eta_s: estimated time left [s]. error: why it failed or waits.
-    warnings: of a ready policy, such as a rule that no start can keep.
+    """What finds ways to keep a rule. progress: in [0, 1]. eta_s: estimated time left [s]. error: why it
+    failed or waits. warnings: of a ready policy, such as a rule that no start can keep.
     """
 
     id: str
@@ -105,7 +105,7 @@ class Beginning(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Residual:
-    """How far x_t lies from the nearest pose that the last decision foresaw: [m], [rad]."""
+    """How far the robot is from the nearest pose that the last decision foresaw: [m], [rad]."""
 
     translation: float
     rotation: float
@@ -163,9 +163,9 @@ def _steps(count: int) -> str:
 class Decision:
     """The decision of step `t`. Sequences without a comment have one entry for each action.
 
-    `execute` is the action to run: `action` as drawn. But a terminal action is never run while the
-    specification is pending: `completion_action` is run then. Once the specification is settled and the main
-    task over, `execute` is the terminal action: nothing is left to do.
+    `execute` is the action to run: the drawn `action`, but `completion_action` if the drawn one ends the main
+    task (a terminal action) while the rule is pending. Once the rule is settled and the main task over,
+    `execute` is the terminal action: nothing is left to do.
     """
 
     t: int
@@ -181,7 +181,7 @@ class Decision:
     kl: float | None
     reason: str | None
     finished: bool
-    in_collision: bool  # x_t touches an obstacle
+    in_collision: bool  # the robot touches an obstacle
     next_poses: tuple[Pose, ...]
     residual: Residual | None
     witness: tuple[int, ...] | None  # the actions that follow `execute`, to the horizon
@@ -246,7 +246,7 @@ class LocalDecision:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a closed session ended. The bounds are those of rho over all continuations; None is infinite."""
+    """How a closed session ended. Bounds: the rule's robustness at worst and at best; None is infinite."""
 
     spec_status: SpecStatus
     robustness_bounds: tuple[float | None, float | None]

@@ -89,9 +89,9 @@ class SessionState:
         return {t: pose for t, pose in self._poses.items() if self._stored <= t < self.t}
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step without a decision, as the service was away, and go on to step t + 1.
+        """Note the pose of step t, which got no decision because the service was away; go on to step t + 1.
 
-        If x_t is on the certified continuation, the robot is taken to run the continuation's next action.
+        If it is on the certified continuation, the robot is taken to run the continuation's next action.
         Raises SessionFinished for a session that was closed.
         """
         if self.closed:
@@ -113,7 +113,7 @@ class SessionState:
         explain: bool = False,
         deadline: float | None = None,
     ) -> Flow[Decision | LocalDecision]:
-        """Decide step t from x_t = (x, y, theta) and one logit for each action; run `decision.execute`.
+        """Decide step t from the pose (x, y, theta) and one logit for each action; run `decision.execute`.
 
         `main_task_done`: leave it None if you run `decision.execute`; the session then remembers a drawn
         terminal action. If you draw from `decision.distribution` yourself, say True or False. Once it is
@@ -123,7 +123,7 @@ class SessionState:
         `explain` the decision says of each forbidden action what it would break. An error leaves the session
         at t: call again with the same pose and logits, or `record` the pose and go on. With `on_failure`
         "witness" or "stop" only errors of the caller are raised; if the service cannot answer, a
-        `LocalDecision` says what to do. It remembers a `main_task_done` of True; signals are lost. While the
+        `LocalDecision` says what to do. A `main_task_done` of True is remembered; signals are lost. While the
         service is known to be away, it is asked with a single try, at pauses of 0.25 to 4 s; steps in between
         return at once, also those that say to stop: a standing robot asks again at its own pace.
         """
@@ -237,10 +237,10 @@ class SessionState:
         """Go on under another rule, on another map or with another robot, from the next step on.
 
         `clock`: with "keep" the new rule's windows count from the same step as the present rule's, at first
-        the session's start; with "restart" from the next step. `pose` is x_t, where the robot is now; without
-        it the service takes x_t to be where the last decision's action leads, and the next step shows the
-        true one. A main task that is over stays over: the robot then only has to keep the new rule. Raises
-        InfeasibleSwitch if the new rule cannot be kept from x_t; nothing is changed then.
+        the session's start; with "restart" from the next step. `pose` is where the robot is now; without it
+        the service takes the robot to be where the last decision's action leads, until the next step says
+        where it is. A main task that is over stays over: the robot then only has to keep the new rule. Raises
+        InfeasibleSwitch if no way to keep the new rule was found; nothing is changed then.
         """
         body = {**policies_asked(policy_id, policy_ids), "clock": clock}
         return (yield from self._ask(pose, lambda x_t: self._switched(x_t, body)))

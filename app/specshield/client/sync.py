@@ -26,9 +26,9 @@ class ShieldClient:
     """A client of the service at `base_url`.
 
     `timeout` [s] is the time for one try of a decision, from looking up the server's name to the last byte.
-    Requests that prepare something (a map, a policy, a session, a switch) get at least 30 s. A request whose
-    answer is lost is sent again (see core.py), so a call returns or raises within five timeouts, a step
-    within its `deadline`. Your own `transport` has to keep these times itself. All errors are
+    Tries that prepare something (a map, a policy, a session, a switch) get at least 30 s. A request whose
+    answer is lost is sent again, so a call returns or raises within five timeouts, a step within its
+    `deadline`. Your own `transport` has to keep these times itself. All errors are
     `SpecshieldError`s; if no answer comes, it is a `TransportError`. `stream`: steps go over one WebSocket
     for each session, in MessagePack, which is faster and needs `pip install 'specshield[stream]'`.
     """
