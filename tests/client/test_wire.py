@@ -64,6 +64,16 @@ def test_an_answer_without_a_document_is_judged_by_its_status(status, cls):
     assert error.details == {"status": status}
 
 
+def test_who_is_redirected_is_told_where_to():
+    """As from http to https, by a proxy."""
+    error = wire.error_of(Reply(301, {"location": "https://robots.example/v1/sessions"}, b"", 0.0, 0.5))
+    assert type(error) is errors.ServerError
+    assert str(error) == (
+        "status 301: the server redirects to https://robots.example/v1/sessions; "
+        "expected an address that does not redirect, as base_url"
+    )
+
+
 def test_an_unknown_type_is_kept_and_falls_back_to_the_status():
     error = wire.error_of(reply(409, {"type": "from-the-future", "detail": "no"}))
     assert type(error) is errors.Conflict

@@ -285,6 +285,9 @@ def error_of(reply: Reply) -> SpecshieldError:
         )
     if document is None:
         document = {"detail": f"status {reply.status} without a problem", "expected": "a specshield server"}
+        if to := reply.headers.get("location"):
+            document["detail"] = f"status {reply.status}: the server redirects to {to}"
+            document["expected"] = "an address that does not redirect, as base_url"
     default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
     cls = _BY_TYPE.get(str(document.get("type")), default)
     message = str(document.get("detail") or document.get("title") or f"status {reply.status}")
