@@ -328,6 +328,42 @@ def test_regions_are_made_with_a_keyboard_alone(small, browse):
     assert complaints == []
 
 
+def test_a_robot_is_tried_with_a_keyboard_alone(server, client, policy, browse):
+    """It is set down, moved and obstructed where the middle of what is seen is; the focus is never lost."""
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/try/{policy['id']}")
+        page.locator("svg.floor.drawing .walls image").wait_for(state="attached")
+        page.locator("svg.floor").focus()
+        page.keyboard.press("Enter")
+        page.get_by_role("heading", name="Step 0").wait_for()
+        robot = page.locator(".robot circle")
+        assert [robot.get_attribute(name) for name in ("cx", "cy")] == ["2", "-1.5"]
+        assert page.evaluate("document.activeElement.textContent") == "Run"
+
+        drop = page.get_by_role("button", name="Drop an obstacle")
+        drop.press("Enter")
+        page.keyboard.press("Enter")
+        page.get_by_text("The robot stands there").wait_for()
+        assert drop.evaluate("button => document.activeElement === button")
+        page.keyboard.press("Enter")
+        for key in ("+", "+", *3 * ["ArrowLeft"], "Enter"):
+            page.keyboard.press(key)
+        page.get_by_text("An obstacle stands there").wait_for()
+        assert float(page.locator(".obstacle").get_attribute("cx")) < 1.5
+
+        elsewhere = page.get_by_role("button", name="Put the robot elsewhere")
+        elsewhere.press("Enter")
+        page.keyboard.press("Escape")
+        assert elsewhere.evaluate("button => document.activeElement === button")
+        assert elsewhere.get_attribute("aria-pressed") == "false"
+        page.keyboard.press("Enter")
+        for key in (*8 * ["ArrowRight"], "Enter"):
+            page.keyboard.press(key)
+        page.get_by_text("The robot was pushed").wait_for()
+        assert float(robot.get_attribute("cx")) > 2.5
+    assert complaints == []
+
+
 def test_two_fingers_draw_nothing_and_zoom_one_draws(small, browse):
     with browse(has_touch=True) as (page, complaints):
         page.goto(small)

@@ -155,4 +155,14 @@ export class Floor {
     const [x, y] = this.zoom.point(event);
     return [x + this.from[0], this.from[1] - y];
   }
+
+  /** Calls `work` with each point that is clicked. Enter stands for a click in the middle of what is seen. */
+  clicked(work) {
+    this.element.addEventListener("click", (event) => work(this.point(event)));
+    this.element.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter") return;
+      event.preventDefault(); // else it would press a button to which `work` moves the focus
+      work(this.seen().middle);
+    });
+  }
 }

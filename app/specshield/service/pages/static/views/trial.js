@@ -29,14 +29,14 @@ export async function show(place, { id, signal }) {
     "section",
     { class: "card", "aria-label": "Begin" },
     el("h2", {}, "Begin"),
-    el("p", {}, "Click on the floor to set the robot down there, or:"),
+    el("p", {}, "Click on the floor to set the robot down there (Enter, on the floor: in the middle of what is seen), or:"),
     el("label", {}, "The model ", model),
     anywhere,
     told,
   );
   place.append(el("h1", {}, `Try ${called(policy)}`), el("p", {}, el("code", {}, policy.spec.formula)), el("div", { class: "watch" }, floor.frame, setup));
   const read = floor.load(signal); // who is quick sets the robot down before that
-  floor.element.addEventListener("click", (event) => begin(floor.point(event)));
+  floor.clicked(begin);
   await read;
   floor.element.classList.add("drawing");
 
@@ -128,10 +128,13 @@ class Controls {
     );
     watch.side.prepend(card);
     watch.floor.layers.marks.append(this.goal);
-    watch.floor.element.addEventListener("click", (event) => this.clicked(watch.floor.point(event)));
+    watch.floor.clicked((point) => this.clicked(point));
+    for (const each of [watch.floor.element, card])
+      each.addEventListener("keydown", (event) => event.key === "Escape" && this.mode && this.choose(this.mode));
     signal.addEventListener("abort", () => this.pause());
     this.setGoal(this.somewhere());
     watch.mark.move(world.pose);
+    this.run.focus({ preventScroll: true }); // what had the focus is gone
     this.once();
   }
 
@@ -159,11 +162,15 @@ class Controls {
     this.goal.toggleAttribute("hidden", this.kind !== "goal");
   }
 
+  /** Begins a mode: the keys go to the floor. The mode that is chosen already ends: they go back to its button. */
   choose(mode) {
     this.mode = this.mode === mode ? null : mode;
     for (const each of this.modes) each.setAttribute("aria-pressed", String(each.dataset.mode === this.mode));
-    this.watch.floor.element.classList.toggle("drawing", this.mode !== null);
-    this.tell(this.mode ? "Click on the floor." : "");
+    const { element } = this.watch.floor;
+    element.classList.toggle("drawing", this.mode !== null);
+    if (this.mode) element.focus();
+    else this.modes.find((each) => each.dataset.mode === mode).focus({ preventScroll: true });
+    this.tell(this.mode ? "Click on the floor. Enter takes the middle of what is seen, Escape leaves it." : "");
   }
 
   clicked(point) {
