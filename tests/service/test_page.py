@@ -433,6 +433,18 @@ def test_a_file_that_holds_no_map_is_named(own, tmp_path, browse):
     assert complaints == []
 
 
+def test_files_are_chosen_by_one_button_and_no_key_leads_to_a_field_that_is_not_seen(own, browse):
+    with browse() as (page, complaints):
+        page.goto(f"{own.url}/#/maps")
+        choose = page.get_by_role("button", name=re.compile("choose file", re.IGNORECASE))
+        with page.expect_file_chooser():
+            choose.press("Enter")  # there is one alone
+        page.get_by_label("Name").focus()
+        page.keyboard.press("Tab")
+        assert page.locator("a.tile").first.evaluate("link => document.activeElement === link")
+    assert complaints == []
+
+
 @needs_houses
 def test_a_real_house(own, browse):
     """A ProcTHOR house with its rooms and a place that is drawn: it is seen why the robot may not go straight

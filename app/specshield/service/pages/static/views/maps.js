@@ -30,7 +30,7 @@ function card(map, signal) {
 function dropZone() {
   const told = el("p", { class: "told", role: "alert" });
   const name = el("input", { name: "name", placeholder: "kitchen-floor", pattern: "[A-Za-z0-9][A-Za-z0-9_.\\-]*", maxlength: 64 });
-  const input = el("input", { type: "file", multiple: true, accept: ".yaml,.yml,.pgm,.png,.json", class: "unseen", id: "files" });
+  const input = el("input", { type: "file", multiple: true, accept: ".yaml,.yml,.pgm,.png,.json", hidden: true, id: "files" });
   const zone = el(
     "section",
     { class: "card drop", "aria-label": "A new map" },
