@@ -364,6 +364,19 @@ def test_a_robot_is_tried_with_a_keyboard_alone(server, client, policy, browse):
     assert complaints == []
 
 
+def test_what_changes_with_each_step_is_not_read_aloud(server, begin, browse):
+    """It would be read for as long as the robot drives. That the steps are not there yet is told, once."""
+    with browse() as (page, _):
+        held = []
+        page.route("**/trajectory", lambda route: held.append(route))
+        page.goto(f"{server.url}/#/sessions/{begin()['id']}")
+        page.get_by_text("the steps are read").wait_for()
+        held[0].continue_()
+        page.get_by_text("live", exact=True).wait_for()
+        aloud = page.locator("main :is(output, [role=status], [role=alert], [aria-live])")
+        assert aloud.all_inner_texts() == ["live"]
+
+
 def test_two_fingers_draw_nothing_and_zoom_one_draws(small, browse):
     with browse(has_touch=True) as (page, complaints):
         page.goto(small)
@@ -728,7 +741,7 @@ def test_no_action_is_said_to_keep_a_broken_rule_nor_signals_to_be_metres(server
         page.get_by_role("heading", name="Step 1").wait_for()
         told = page.locator(".told.can").all_inner_texts()
         assert set(told) == {"is broken; what is left of it can be kept"}
-        chart = page.locator(".chart", has_text="Robustness ahead").locator("output")
+        chart = page.locator(".chart", has_text="Robustness ahead").locator("figcaption span")
         assert re.fullmatch(r"−\d+\.\d\d", chart.inner_text())
         assert page.locator("dl.numbers dt", has_text=re.compile("^Kept$")).count() == 0
         page.get_by_label("Step", exact=True).fill("0")

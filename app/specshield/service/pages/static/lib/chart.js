@@ -9,7 +9,7 @@ export class Chart {
   constructor(name, told, zero = true) {
     this.told = told;
     this.zero = zero;
-    this.value = el("output");
+    this.value = el("span");
     this.line = svg("polyline", { class: "line" });
     this.base = svg("line", { class: "base", x1: 0, x2: WIDE });
     this.now = svg("line", { class: "now", y1: 0, y2: HIGH });

@@ -14,7 +14,7 @@ export class Replay {
     this.slider = el("input", { type: "range", min: 0, max: 0, value: 0, "aria-label": "Step", oninput: () => this.go(Number(this.slider.value)) });
     this.play = button("Play", () => this.toggle());
     this.live = button("Newest", () => this.newest(), { "aria-pressed": "true" });
-    this.told = el("output", { class: "number" }, "0");
+    this.told = el("span", { class: "number" }, "0");
     this.element = el("div", { class: "replay row", role: "group", "aria-label": "Replay" }, this.play, this.slider, this.told, this.live);
   }
 

@@ -15,6 +15,7 @@ export async function show(place, { id, signal }) {
   place.append(el("div", { class: "row spread" }, el("h1", {}, session.id), state.element), watch.element);
   watch.side.append(about(session));
   await watch.load(signal);
+  state.say("the steps are read …");
   const { items } = await ask(`${path}/trajectory`, { signal });
   for (const item of items) watch.push(item);
   const decided = items.findLast((item) => item.decision)?.t;
