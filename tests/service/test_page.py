@@ -503,11 +503,21 @@ def test_a_floor_with_robots_that_are_over(server, client, begin, step, browse):
     for session in sessions:
         for t, pose in enumerate(ahead(3)):
             assert step(session, t, [pose]).status_code == 200
-        client.post(f"/v1/sessions/{session['id']}/close", json={})
+    client.post(f"/v1/sessions/{sessions[0]['id']}/close", json={})
     with browse() as (page, complaints):
         page.goto(f"{server.url}/#/floor?sessions={','.join(session['id'] for session in sessions)}")
         page.locator(".walls image").wait_for(state="attached")
         page.get_by_text("3 / 3").wait_for()
+        page.get_by_text("live", exact=True).wait_for()
+        modes = page.locator("tbody td:nth-child(3)")
+        assert modes.all_inner_texts() == ["over", "shaped"]
+        client.post(f"/v1/sessions/{sessions[1]['id']}/close", json={})  # while it is watched
+        page.locator(".state").get_by_text("over").wait_for()
+        assert modes.all_inner_texts() == ["over", "over"]
+        page.get_by_label("Step", exact=True).fill("1")
+        page.locator("tbody td").get_by_text("shaped").nth(1).wait_for()
+        page.get_by_role("button", name="Newest").click()
+        page.locator("tbody td").get_by_text("over").nth(1).wait_for()
         assert page.locator(".robot:not([hidden])").count() == 2
         assert page.locator("tbody td.number").first.inner_text() == "3"
         floor = page.locator("svg.floor")

@@ -82,7 +82,7 @@ export async function show(place, { query, signal }) {
     const each = by.get(item.session);
     if (item.rule >= each.session.rules.length) return dispatchEvent(new Event("hashchange")); // another rule, or floor
     state.heard();
-    if (item.finished) Object.assign(each.session, { spec_status: item.spec_status ?? each.session.spec_status, erased: item.erased });
+    if (item.finished) Object.assign(each.session, { finished: true, spec_status: item.spec_status ?? each.session.spec_status, erased: item.erased });
     else {
       each.items[item.t] = item;
       hear(each);
@@ -152,8 +152,10 @@ function shown({ session, items, mark, learned, row }, t) {
   const { decision } = item;
   const mass = decision?.feasible_mass;
   const without = items.some((each) => each?.decision) ? "over" : items.length > 1 ? "not shielded" : "–";
-  const status = t >= items.length - 1 ? (decision?.spec_status === "pending" ? session.spec_status : decision?.spec_status ?? session.spec_status) : (decision?.spec_status ?? "pending");
-  const cells = [item.t, decision?.mode ?? without, mass === null || mass === undefined ? "–" : percent(mass)];
+  const newest = t >= items.length - 1;
+  const status = newest ? (decision?.spec_status === "pending" ? session.spec_status : decision?.spec_status ?? session.spec_status) : (decision?.spec_status ?? "pending");
+  const mode = decision && !(newest && session.finished) ? decision.mode : without;
+  const cells = [item.t, mode, mass === null || mass === undefined ? "–" : percent(mass)];
   cells.forEach((text, k) => (row.children[k + 1].textContent = text));
   const told = session.erased ? "erased" : status;
   row.children[4].replaceChildren(el("span", { class: `badge ${told}` }, told));
