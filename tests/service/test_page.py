@@ -16,7 +16,7 @@ from tests.browsing import needs_chromium
 from tests.houses import HOUSES, needs_houses
 from tests.service.test_switch import CRAWLER, END
 from tests.service.world import ROBOT, START, ahead, grid_json, send_policy
-from tests.serving import serving, wait_for
+from tests.serving import run_specshield, serving, wait_for
 from tests.world.test_procthor import SIZES, house
 
 pytestmark = needs_chromium
@@ -786,6 +786,28 @@ def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path, browse):
         kept = page.evaluate("[localStorage.length, document.cookie, location.href]")
         assert kept[:2] == [0, ""]
         assert "secret" not in kept[2]
+
+
+def test_nothing_is_called_live_once_the_key_is_revoked_until_a_new_one_is_typed(tmp_path, browse):
+    def keys(*arguments):
+        return run_specshield("keys", *arguments, SPECSHIELD_DATA_DIR=str(tmp_path / "data")).stdout.strip()
+
+    with serving(tmp_path / "data", SPECSHIELD_API_KEY="operator") as running, browse() as (page, _):
+        secret, field = keys("create", "alice"), page.get_by_label("API key")
+        body = {"id": "watched", "policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+        headers = {"Authorization": f"Bearer {secret}"}
+        begun = httpx.post(f"{running.url}/v1/sessions", json=body, headers=headers, timeout=None)
+        assert begun.status_code == 201, begun.text
+        page.goto(f"{running.url}/#/sessions/watched")
+        field.fill(secret)
+        field.press("Enter")
+        page.get_by_text("live", exact=True).wait_for()
+        keys("revoke", "alice")
+        page.get_by_text("The server does not know this key.").wait_for()
+        page.get_by_text("not live: the connection was lost at").wait_for()
+        field.fill(keys("create", "alice"))
+        field.press("Enter")
+        page.get_by_text("live", exact=True).wait_for()
 
 
 def test_its_files_are_small_tagged_and_allow_nothing_from_elsewhere(server):

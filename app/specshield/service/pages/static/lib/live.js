@@ -41,6 +41,7 @@ export async function follow(after, created, take, connected, signal) {
           take(item);
         }
       }
+      if (after.size) connected(false); // the server stops, say, or the key was revoked
     } catch (error) {
       if (line.silent || passes(error)) {
         if (!signal.aborted) connected(false);
