@@ -3,7 +3,7 @@
     make run                                                            # the service, in one terminal
     .venv/bin/python examples/own_house.py http://127.0.0.1:8000        # this, in another
 
-Needs the SDK alone (`pip install .` in a clone).
+Needs the SDK alone (`pip install -e .` in a clone).
 """
 
 from __future__ import annotations
