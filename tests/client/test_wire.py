@@ -70,7 +70,7 @@ def test_who_is_redirected_is_told_where_to():
     assert type(error) is errors.ServerError
     assert str(error) == (
         "status 301: the server redirects to https://robots.example/v1/sessions; "
-        "expected an address that does not redirect, as base_url"
+        "expected a specshield server at base_url"
     )
 
 

@@ -280,21 +280,18 @@ def error_of(reply: Reply) -> SpecshieldError:
     problem = reply.headers.get("content-type", "").startswith("application/problem+json")
     document = reply.document if problem and isinstance(reply.document, dict) else None
     if document is None and reply.status in _GATEWAY:  # a proxy in front of the server has answered
-        return _GATEWAY[reply.status](
-            f"the server cannot be reached: status {reply.status}", status=reply.status
-        )
+        what = f"the server cannot be reached: status {reply.status}"
+        return _GATEWAY[reply.status](what, status=reply.status)
     if document is None:
-        document = {"detail": f"status {reply.status} without a problem", "expected": "a specshield server"}
-        if to := reply.headers.get("location"):
-            document["detail"] = f"status {reply.status}: the server redirects to {to}"
-            document["expected"] = "an address that does not redirect, as base_url"
+        to = reply.headers.get("location")
+        what = f": the server redirects to {to}" if to else " without a problem"
+        document = {"detail": f"status {reply.status}{what}", "expected": "a specshield server at base_url"}
     default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
     cls = _BY_TYPE.get(str(document.get("type")), default)
     message = str(document.get("detail") or document.get("title") or f"status {reply.status}")
     error = cls(message, **{name: document.get(name) for name in ("path", "got", "expected")})
-    told = {"title", "detail", "path", "got", "expected"} | (
-        {"type"} if cls.type == document.get("type") else set()
-    )
+    known = {"type"} if cls.type == document.get("type") else set()
+    told = {"title", "detail", "path", "got", "expected"} | known
     error.details.update({"status": reply.status, **{k: v for k, v in document.items() if k not in told}})
     return error
 
