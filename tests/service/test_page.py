@@ -543,7 +543,7 @@ def test_a_floor_with_robots_that_are_over(server, client, begin, step, browse):
     assert complaints == []
 
 
-def test_a_floor_that_came_after_the_list_was_opened_is_called_by_its_name(own, browse):
+def test_robots_are_found_by_what_is_told_of_them_and_a_new_floor_by_its_name(own, browse):
     sent = grid_json() | {"name": "new-floor"}
     sent["info"]["resolution"] = 0.12
     goal = {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}
@@ -555,8 +555,18 @@ def test_a_floor_that_came_after_the_list_was_opened_is_called_by_its_name(own, 
         path = f"/v1/policies/{client.post('/v1/policies', json=body).json()['id']}"
         wait_for(lambda: client.get(path).json()["status"] == "ready")
         begun = {"policy_id": path.split("/")[-1], "initial_pose": START}
-        assert client.post("/v1/sessions", json=begun).status_code == 201
+        for id in ("day-shift", "night-shift"):
+            assert client.post("/v1/sessions", json={**begun, "id": id}).status_code == 201
         page.get_by_role("heading", name="new-floor").wait_for()
+        rows, words = page.locator("tbody th"), page.get_by_label("Find robots")
+        words.fill("PENDING night new-floor")
+        page.wait_for_function("document.querySelectorAll('tbody tr').length === 1")
+        assert rows.all_inner_texts() == ["night-shift"]
+        look(page, "find")
+        words.fill("nothing of the kind")
+        page.get_by_text("has these words in its name").wait_for()
+        words.fill("")
+        rows.get_by_text("day-shift").wait_for()
     assert complaints == []
 
 

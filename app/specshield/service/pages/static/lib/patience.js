@@ -5,6 +5,7 @@ import { problem } from "./dom.js";
 import { notice } from "./notice.js";
 
 const AGAIN = 2000; // [ms] before it asks again
+const SHARE = 10; // Of the time that looks take, the pauses between them are at least so many times as long. By hand.
 const LONGEST = 60_000; // [ms] for one look; chosen by hand: a connection that was cut off may stay silent for ever
 
 export const pause = (ms) => new Promise((done) => setTimeout(done, ms));
@@ -33,15 +34,21 @@ function trouble(error) {
 }
 
 /**
- * Calls `look` every `wait` milliseconds while the page is visible, with a signal that also ends a look that takes
- * too long. An error against which waiting does not help ends this, and is shown in `place`.
+ * Calls `look` every `wait` milliseconds, or less often if looks take long, while the page is visible, with a signal
+ * that also ends a look that takes too long. An error against which waiting does not help ends this, and is shown in `place`.
  */
 export async function again(look, wait, place, signal) {
+  let took = 0; // [ms]
+  const timed = async () => {
+    const began = performance.now();
+    await look(AbortSignal.any([signal, AbortSignal.timeout(LONGEST)]));
+    took = performance.now() - began;
+  };
   try {
     for (;;) {
-      await pause(wait);
+      await pause(Math.max(wait, SHARE * took));
       if (signal.aborted) return;
-      if (!document.hidden) await patiently(() => look(AbortSignal.any([signal, AbortSignal.timeout(LONGEST)])), signal);
+      if (!document.hidden) await patiently(timed, signal);
     }
   } catch (error) {
     if (!signal.aborted) place.append(problem(error));

@@ -11,26 +11,43 @@ const MOST = 64; // robots on one picture
 export async function show(place, { signal }) {
   const names = new Map(); // of the floors that were seen
   const list = el("div", { class: "stack" });
-  let [before, count] = ["", Infinity];
+  const asked = el("input", {
+    type: "search",
+    placeholder: "Find robots",
+    "aria-label": "Find robots by name, floor, rule or state",
+    oninput: () => say(`${paint(list, sessions, names, asked)} of ${sessions.length} robots`),
+  });
+  let [sessions, before] = [[], ""];
   const look = async (signal) => {
-    const sessions = (await all("v1/sessions", { signal })).reverse();
-    const unknown = sessions.filter(({ map_id }) => !names.has(map_id));
+    const [count, found] = [sessions.length, (await all("v1/sessions", { signal })).reverse()];
+    const unknown = found.filter(({ map_id }) => !names.has(map_id));
     const maps = unknown.length ? await all("v1/maps", { signal }) : [];
     for (const { map_id: id } of unknown) names.set(id, called(maps.find((map) => map.id === id) ?? { id })); // it may be deleted
-    const now = JSON.stringify(sessions.map(({ expires_at: _, ...rest }) => rest));
-    if (now !== before) paint(list, sessions, names);
-    if (sessions.length > count) say(`${sessions.length} robots`);
-    [before, count] = [now, sessions.length];
+    const now = JSON.stringify(found.map(({ expires_at: _, ...rest }) => rest));
+    sessions = found;
+    if (now !== before) paint(list, sessions, names, asked);
+    if (before && sessions.length > count) say(`${sessions.length} robots`);
+    before = now;
   };
   await look(signal);
-  place.append(el("h1", {}, "Robots"), list);
+  place.append(el("div", { class: "row spread" }, el("h1", {}, "Robots"), asked), list);
   again(look, EVERY, place, signal);
 }
 
-function paint(list, sessions, names) {
-  if (!sessions.length) return list.replaceChildren(nobody());
-  const floors = [...Map.groupBy(sessions, (session) => session.map_id)];
-  keep(list, floors, { key: ([id]) => id, make: ([id]) => floor(names.get(id)), fill: fillFloor });
+/** Shows the robots that have each of the words that are `asked` for, and returns how many these are. */
+function paint(list, sessions, names, asked) {
+  asked.hidden = !sessions.length;
+  const words = asked.value.toLowerCase().split(/\s+/);
+  const found = sessions.filter((session) => {
+    const told = [session.id, names.get(session.map_id), session.spec.formula, session.spec_status, state(session)];
+    const text = told.join(" ").toLowerCase();
+    return words.every((word) => text.includes(word));
+  });
+  const floors = [...Map.groupBy(found, (session) => session.map_id)];
+  if (!sessions.length) list.replaceChildren(nobody());
+  else if (!found.length) list.replaceChildren(el("p", {}, `None of ${sessions.length} robots has these words in its name, floor, rule or state.`));
+  else keep(list, floors, { key: ([id]) => id, make: ([id]) => floor(names.get(id)), fill: fillFloor });
+  return found.length;
 }
 
 function floor(name) {
@@ -73,8 +90,10 @@ function fillRow(row, session) {
   write(steps, step(session));
   status.firstChild.className = `badge ${session.spec_status}`;
   write(status.firstChild, session.spec_status);
-  write(robot, session.finished ? "over" : session.main_task_done ? "completing the rule" : "under way");
+  write(robot, state(session));
 }
+
+const state = ({ finished, main_task_done: done }) => (finished ? "over" : done ? "completing the rule" : "under way");
 
 /** How far a robot is in its rule; a session that was only told where its robot was has no step. */
 function step({ next_t: t, rules, finished }) {
