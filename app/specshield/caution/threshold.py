@@ -25,6 +25,7 @@ from specshield.compiled import Boxed, kernel, leaf
 from specshield.portable import inner
 from specshield.robot.body import Body, centre, displacement
 from specshield.robot.contact import free_distance
+from specshield.shield.certificate import Witnesses
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Prefix, rho_of
 from specshield.stl import SATISFIED_ABOVE
@@ -39,9 +40,12 @@ SHARP, STOPS = 1.5, 0.5  # [rad] if no turn is smaller, this share of contacts e
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # more slips of one future, or less probable ones, are not counted. By hand.
 
 
-def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
-    """V of each action [A]; 0 for a terminal one. doubts [M]: motions that get V = 0 if they are not
-    feasible while others are, though some future of theirs may keep the rule.
+def chances(
+    shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools, certified: Witnesses
+) -> tuple[Floats, Witnesses]:
+    """V of each action [A], 0 for a terminal one; and what follows each motion in the future that shows its
+    V, unless the motion is `certified` and has its witness already. doubts [M]: motions that get V = 0 if
+    they are not feasible while others are, though some future of theirs may keep the rule.
     """
     tried, task = judged.tried, shield.task
     view, parts = conjunction_of(task, prefix.formula)
@@ -51,14 +55,19 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # futures set aside do not count
     still, values = np.empty(len(parts.value.kind), np.bool_), np.zeros(len(task.robot.motions))
+    shown = np.zeros(len(values), np.int64)
     any_visit, settled = np.full(len(still), SATISFIED_ABOVE), np.empty(len(still))
     find_open(parts, prefix.known, prefix.t, any_visit, still, settled)
     blunt = all(abs(turn) >= SHARP for _, turn in task.robot.motions if turn != 0.0)
     body, ways = (shield.body, blunt), (leaves, rho, tried.motions, tried.poses, task.robot.wait_motion)
-    _chances(parts, still, prefix.t, body, (care.noise, care.stride, care.margin), *ways, values)
+    _chances(parts, still, prefix.t, body, (care.noise, care.stride, care.margin), *ways, values, shown)
     if judged.some:
         values[doubts & ~judged.feasible_motion] = 0.0
-    return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
+    onward = tuple(  # an action with a chance has to have it at the next step too, certified or not
+        bytes(tried.motions[f, 1:].tolist()) if way is None and value > 0.0 else way
+        for way, value, f in zip(certified, values.tolist(), shown.tolist(), strict=True)
+    )
+    return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0), onward
 
 
 @kernel
@@ -74,9 +83,11 @@ def _chances(
     poses: Floats,
     wait: int,
     values: Floats,
+    shown: Ints,
 ) -> None:
-    """Writes V of each motion's best future into values (M,), which hold 0. still (K,): what is open. robot:
-    its body, and whether it has no turn below SHARP. care: the noise, stride and margin of the `Care`.
+    """Writes V of each motion's best future into values (M,), which hold 0, and the future's row into shown
+    (M,). still (K,): what is open. robot: its body, and whether it has no turn below SHARP. care: the noise,
+    stride and margin of the `Care`.
     """
     parts, (body, blunt), (noise, stride, margin) = boxed.value, robot, care
     count, spread = still.shape[0], spread_of(noise, stride)
@@ -114,7 +125,8 @@ def _chances(
             never = _in_time(noise, spread, False, due, motions[f, :last], wait, dwells, late)
             slips = _in_time(noise, spread, True, due, motions[f, :last], wait, dwells, late)
             chance *= (1.0 - noise.slips) * never + noise.slips * slips
-        values[motions[f, 0]] = max(values[motions[f, 0]], chance)
+        if chance > values[motions[f, 0]]:
+            values[motions[f, 0]], shown[motions[f, 0]] = chance, f
 
 
 @leaf

@@ -129,7 +129,7 @@ def decide(
     tail, residual = _follow(carry, poses, task.horizon - t, shield.body)
     before, shield = shield, with_begun(shield, carry, poses)
     memory, weights = None if carry is None else carry.memory, None
-    chance, left = None, shield.config.threshold
+    chance, onward, left = None, None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
     foreseen = residual is not None and max(residual) <= SAME_POSE
     care = wary(shield, care, taught, shield is not before or (foreseen and tail is not None))
@@ -160,7 +160,7 @@ def decide(
                     "the preference's weights are not numbers, one for each action: it is left out",
                 )
         if shield.config.threshold_over == "episode" and spec_status == "pending":
-            chance = chances(shield, care, prefix, judged, doubts)
+            chance, onward = chances(shield, care, prefix, judged, doubts, certified.witnesses)
             left = left_of(shield, carry, chance)
         answer = answer_of(shield, log_prior, certified, main_task_done, weights, chance, left)
         if spec_status == "violated":
@@ -211,7 +211,7 @@ def decide(
         carry=Carry(
             t,
             nexts,
-            ways,
+            onward or ways,
             memory,
             residuals=remembered,
             threshold_left=left if shield.config.threshold_over == "episode" else None,
