@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from evaluation.shipped import shipped
-from specshield.episode import decide, make_shield
+from specshield.episode import Config, decide, make_shield
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import motion_count, simulate
+from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -77,6 +78,16 @@ def test_where_the_rest_is_lost_it_still_leaves():
         history, carry = [*history, tuple(decision.next_poses[decision.action])], decision.carry
     assert task.horizon > len(history)
     assert not inside(history[-1])
+
+
+def test_a_visit_that_would_keep_it_inside_is_not_asked_for_and_the_answer_says_so():
+    beside = {"type": "circle", "center": [3.2, 2.5], "radius": 0.15}
+    task = make_task(ROOM, BODY, "G[0,12] not K and F[0,6] B", {"K": REGIONS["K"], "B": beside})
+    for x, told in ((2.9, False), (2.1, True)):  # beside the way out, or on the other side of the region
+        shield = make_shield([planner.synthesise(task)], Config(uncertainty=Uncertainty()))
+        decision = decide(shield, [(x, 2.5, math.pi)], np.zeros(5))
+        assert decision.mode == "violated"
+        assert any("keeps F[0,6] B beside that" in said for said in decision.warnings) == told
 
 
 ROOM = OccupancyGrid(np.zeros((120, 120), bool), 0.05)

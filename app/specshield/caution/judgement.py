@@ -105,7 +105,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
                 values = best_of(tried.motions, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     if violated and recovers(shield.config):
-        tried = tried._replace(warnings=(*tried.warnings, *given_up(prefix)))
+        tried = tried._replace(warnings=(*tried.warnings, *given_up(prefix, part.formula)))
     first = tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]

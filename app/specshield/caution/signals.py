@@ -45,7 +45,7 @@ def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation
     found = _judged_at_worst(shield, now)
     shield, now, judged = found or (shield, now, judge(shield, now))
     if broken and recovers(shield.config):
-        said = (*judged.tried.warnings, *given_up(other))
+        said = (*judged.tried.warnings, *given_up(other, other.formula))
         judged = judged._replace(tried=judged.tried._replace(warnings=said))
     if least < np.inf:
         values = judged.values if broken else np.minimum(judged.values, least)

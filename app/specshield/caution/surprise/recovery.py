@@ -15,6 +15,7 @@ from specshield.robot.dynamics import simulate
 from specshield.shield.decision import Config, Shield
 from specshield.shield.feasibility import Prefix, rho_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts, verdict
+from specshield.stl.conjunction import flat
 
 BETTER = 0.01  # [m] what brings the robot nearer by less may be a push against an obstacle; chosen by hand
 
@@ -54,13 +55,16 @@ def most_kept(
     return int(futures[best, 0]), tuple(lost), tuple(said), better
 
 
-def given_up(prefix: Prefix) -> tuple[str, ...]:
-    """A sentence for each part of a violated rule that is lost."""
+def given_up(prefix: Prefix, asked: Formula) -> tuple[str, ...]:
+    """A sentence for each part of a violated rule that is lost, or is not among what is `asked` for now."""
     rule, samples = prefix.formula, prefix.task.samples(prefix.poses, prefix.signals)
     kept, broken = left_over(rule, samples, prefix.t)
     done = [verdict(part, samples) == "satisfied" for part in again(broken, prefix.t + 1)]
+    wanted, pending = conjuncts(asked), [part for part in kept if verdict(part, samples) == "pending"]
+    put_off = [p for p in pending if p not in wanted and not (isinstance(p, Always) and flat(p) in wanted)]
     now = ["what was left of it is kept" if each else "is kept again as soon as it can be" for each in done]
     return (
         *(f"{part} was not kept, and is given up" for part in conjuncts(rule) if part not in kept + broken),
         *(f"{part} was broken, and {then}" for part, then in zip(broken, now, strict=True)),
+        *(f"no way that was tried keeps {part} beside that, so it is not asked for now" for part in put_off),
     )
