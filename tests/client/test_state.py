@@ -326,12 +326,6 @@ def test_what_the_session_keeps_in_hand_is_told_apart_from_the_rule(margin, slac
     assert decision.why("b") == f"b is forbidden: F[50,100] Region2 could still be kept, {line}"
 
 
-def test_a_signal_that_may_rise_is_told_as_one_that_may():
-    told = {"conjunct": "G[0,60] (call > 0.5 -> F[0,12] Dock)", "robustness": -0.3, "late_by": 1}
-    decision, _ = step(session(), 0, decided(0, M, explanations=[None, told, None], any_signal=True))
-    assert decision.why("b").endswith("comes 1 step too late, should its signals call for it")
-
-
 def test_a_step_that_was_not_asked_to_explain_says_so():
     decision, _ = step(session(), 0, decided(0, M))
     assert "explain=True" in decision.why("b")

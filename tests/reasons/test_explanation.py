@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from specshield.episode import decide, make_shield
+from specshield.policy.planner import policy as planner
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.shield.decision import Config
 from specshield.shield.proposal import Proposal
+from specshield.shield.uncertainty import Uncertainty
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
-from tests.oracles.cells import FORWARD, MOTIONS, WAIT, Cells, Exhaustive, Scripted
+from tests.oracles.cells import FORWARD, MOTIONS, ROBOT, WAIT, Cells, Exhaustive, Scripted
 from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
@@ -264,3 +266,26 @@ class Counted:
         motions = np.zeros((count, self.task.horizon + 1 - len(history)), np.int64)
         motions[:, 0] = np.arange(count)
         return Proposal(motions, 0)
+
+
+@pytest.mark.parametrize(
+    ("formula", "now", "changes"),
+    [
+        ("G[0,9] (not B or e > 0.5)", 1.0, True),
+        ("G[0,9] (not B or e > 0.5)", 0.0, False),
+        ("G[0,9] (e > 0.5 -> not B)", 0.0, True),
+        ("G[0,9] (e > 0.5 -> not B)", 1.0, False),
+        ("G[0,9] (e > 0.5 -> F[0,0] not B)", 0.0, True),
+        ("G[0,9] not B and G[0,9] (e > 0.5 -> F[0,9] not B)", 0.0, False),
+    ],
+)
+def test_what_fails_only_if_a_signal_changes_is_told_as_such(formula, now, changes):
+    beside = {"B": {"type": "rectangle", "min": [0.8, 0.0], "max": [1.0, 0.6]}}
+    task = make_task(
+        OccupancyGrid(np.zeros((12, 24), bool), 0.05), ROBOT, formula, beside, signals={"e": now}
+    )
+    shield = make_shield([planner.synthesise(task)], Config(uncertainty=Uncertainty(), any_signal=True))
+    told = decide(shield, [(0.7, 0.3, 0.0)], EVEN, explain=explanations).explanations[FORWARD]
+    assert "B" in told.conjunct
+    assert told.robustness < 0.0
+    assert (told.detail or "").endswith(", if the signal e changes") == changes

@@ -217,9 +217,7 @@ class Decision:
         told = self.explanations[i]
         if told is None:
             return f"{name} is not forbidden"
-        why = told.beside(self.margin, self.slack)
-        called = ", should its signals call for it" if self.any_signal and "->" in told.conjunct else ""
-        return f"{name} is forbidden: {why}{called}"
+        return f"{name} is forbidden: {told.beside(self.margin, self.slack)}"
 
 
 @dataclass(frozen=True)

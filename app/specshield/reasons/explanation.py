@@ -36,6 +36,7 @@ ASKED, WITNESSES, MET = 42, 7, 49  # times that it is, in a decision; witnesses 
 SAME = 1e-6  # [m] and [rad]: poses this near are one pose
 
 Rank = tuple[int, float]
+Read = dict[str, Floats]  # what a formula reads along a future: an array [m] for each name
 KEPT, KEEPS_ALL, LATE, BROKEN, SEVERAL, NOTHING = range(6)  # what a future shows, the most telling first
 
 
@@ -80,12 +81,13 @@ class _Motion:
             if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
                 break  # all further futures are as late or later
             poses = driven(self.shield, self.prefix.poses, rows)
-            samples = task.samples(poses, dict(zip(task.signals, self.prefix.foreseen.T, strict=True)))
+            held = (self.prefix.foreseen, np.concatenate([self.prefix.rows, self.prefix.rows[-1:]]))
+            samples, calm = (task.samples(poses, dict(zip(task.signals, v.T, strict=True))) for v in held)
             rho = np.array([values_of(part, samples) for part in parts])  # [parts, rows]
             asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):
-                row = {name: values[n] for name, values in samples.items()}
-                order, told = self.shows(parts, rho[:, n], asked[:, n], row)
+                row, steady = ({name: v[n] for name, v in each.items()} for each in (samples, calm))
+                order, told = self.shows(parts, rho[:, n], asked[:, n], row, steady)
                 if order < rank:
                     best, rank = told, order
         return best
@@ -116,48 +118,57 @@ class _Motion:
         return asked
 
     def shows(
-        self, parts: Sequence[Formula], rho: Floats, asked: Floats, row: dict[str, Floats]
+        self, parts: Sequence[Formula], rho: Floats, asked: Floats, row: Read, steady: Read
     ) -> tuple[Rank, Explanation]:
         """How telling a future is, and what it shows. rho [parts]: of the conjuncts; asked [parts]: see
-        `asked`; row {name: [m]}: what the formula reads along the future.
+        `asked`; row: what the formula reads along the future; steady: the same if the signals stay as they
+        are now.
         """
         failing = np.flatnonzero(rho <= SATISFIED_ABOVE)
         if not len(failing):
             i = int(np.argmin(asked))
             whole = self.doubtful or asked[i] > SATISFIED_ABOVE + self.judged.aimed.margin
-            late, detail = (None, self.known(parts[i], 0)) if whole else self.lacks(parts[i], row)
+            late, detail = (None, self.known(parts[i], 0)) if whole else self.lacks(parts[i], row, steady)
             order = (KEEPS_ALL if whole else KEPT), late or 0
             return order, Explanation(str(parts[i]), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
         late = late_by(parts[i], row, self.prefix.t) if len(failing) == 1 else None
-        told = Explanation(str(parts[i]), float(rho[i]), late, self.fails(parts, i, rho, row, late))
+        told = Explanation(str(parts[i]), float(rho[i]), late, self.fails(parts, i, rho, row, steady, late))
         if late is not None:
             return (LATE, late), told
         return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
 
     def fails(
-        self, parts: Sequence[Formula], i: int, rho: Floats, row: dict[str, Floats], late: int | None
+        self, parts: Sequence[Formula], i: int, rho: Floats, row: Read, steady: Read, late: int | None
     ) -> str | None:
         """How conjunct i fails on a future, and what becomes of the others; None where `late` and the
-        robustness say it all. rho [parts], row: as in `shows`.
+        robustness say it all. rho [parts], row, steady: as in `shows`.
         """
         conjunct, task = parts[i], self.prefix.task
         words = in_words(conjunct, row, self.prefix.t, late)
         others = [f"'{part}'" for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE]
         unit = " m" if set(conjunct.names) <= {"x", "y", *task.areas} else ""
-        missed = f"it falls short by {abs(rho[i]):.3g}{unit}"
+        missed, called = f"it falls short by {abs(rho[i]):.3g}{unit}", self.called(conjunct, steady)
         if words is None:
-            if len(parts) == 1:
+            if len(parts) == 1 and not called:
                 return None
             words = missed if late is None else f"it comes {steps(late)} too late"
         elif late is None and not others:
             by = "by" if isinstance(conjunct, Always) else "and the part is missed by"
             words = f"{words}, {by} {abs(rho[i]):.3g}{unit}"
+        words += called
         if others:
             return f"{words}, and it does not keep {' and '.join(others)} either"
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
 
-    def lacks(self, part: Formula, row: dict[str, Floats]) -> tuple[int | None, str]:
+    def called(self, part: Formula, steady: Read) -> str:
+        """Words to add to what fails only because the signals are taken to do their worst."""
+        if float(values_of(part, steady)) <= SATISFIED_ABOVE:
+            return ""
+        names = [name for name in self.prefix.task.signals if name in part.names]
+        return f", if the signal {names[0]} changes" if len(names) == 1 else ", if the signals change"
+
+    def lacks(self, part: Formula, row: Read, steady: Read) -> tuple[int | None, str]:
         """For a conjunct that is kept along `row`, but not with the margin or the slack that J asks for: how
         many steps too late it is for that, None if time is not what it lacks; and what it lacks, in words.
         """
@@ -170,6 +181,7 @@ class _Motion:
                 return late, (
                     f"a way was found after it that keeps the rule, but none with the {steps(reserve)} in "
                     f"reserve that other actions leave: on the best one {when(asked, late)} for that"
+                    f"{self.called(asked, steady)}"
                 )
         return None, self.known(part, reserve)
 
