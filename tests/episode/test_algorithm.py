@@ -686,3 +686,17 @@ def test_no_preference_makes_an_action_feasible(weights):
     assert found.distribution.tolist() == usual.distribution.tolist()
     fit = weights is not None and bool(np.all(weights < np.inf))
     assert any("weights" in said for said in found.warnings) is not fit
+
+
+@pytest.mark.parametrize("over", ["step", "episode"])
+def test_a_preference_weighs_the_feasible_actions(over):
+    goes, comes_back = Scripted(REACH, lambda t, m: [FORWARD]), Scripted(REACH, lambda t, m: [RIGHT, FORWARD])
+    plain, weights = (
+        make_shield([goes, comes_back], Config(threshold_over=over)),
+        np.array([0, -1, 0, -2, 0.0]),
+    )
+    usual = decide(plain, [START], EVEN).distribution
+    found = decide(replace(plain, preference=Meddler(weights)), [START], EVEN).distribution
+    going_on = usual[:MOTIONS] * np.exp(weights[:MOTIONS])
+    assert found[MOTIONS] == usual[MOTIONS]
+    np.testing.assert_allclose(found[:MOTIONS], going_on / going_on.sum() * (1.0 - usual[MOTIONS]))

@@ -48,17 +48,17 @@ def answer_of(
     if conditional is None:  # the model ends for certain
         return Answer(exp(log_prior), mode, None if any_feasible else "infeasible")
     config, attainable = shield.config, any_feasible
+    wanted = conditional if weights is None else conditional + weights
     if config.evaluation == "robustness":
         shaped = shaping.tilt(conditional, certified.values, config.threshold)
         attainable = bool(certified.values.max() >= config.threshold)
     elif chance is not None and chance.max() > 0.0:
         shaped = None
         if left > 1.0 - 1e-9:  # the best chance is asked for: of the actions that have it, those in S_t
-            shaped = shaping.restrict(conditional, certified.feasible & (chance >= chance.max()))
+            shaped = shaping.restrict(wanted, certified.feasible & (chance >= chance.max()))
         if shaped is None:
             shaped = shaping.tilt(conditional, chance, left * float(chance.max()))
     elif config.threshold == 1.0 or config.threshold_over == "episode":
-        wanted = conditional if weights is None else conditional + weights
         shaped = shaping.restrict(wanted, certified.feasible)
     else:
         shaped = shaping.soften(conditional, certified.feasible, config.threshold)
