@@ -122,6 +122,18 @@ EAST = {"type": "rectangle", "min": [3.0, 1.0], "max": [3.9, 2.0]}
 
 
 RESTLESS = replace(STRETCH, name="restless", actions=STRETCH.actions[:4])  # ahead, right, left, back
+TRAILING = robot_from_json(
+    {
+        "footprint": {"radius": 0.18, "offset": [-0.08, 0.0]},
+        "on_contact": "stop",
+        "actions": [
+            {"name": "on", "translate": 0.25},
+            {"name": "left", "rotate": 0.5236},
+            {"name": "right", "rotate": -0.5236},
+            {"name": "wait"},
+        ],
+    }
+)
 
 
 def two_rooms(formula, robot=STRETCH):
@@ -133,10 +145,14 @@ def two_rooms(formula, robot=STRETCH):
     return task, make_body(robot, replace(grid, occupied=shut))
 
 
-@pytest.mark.parametrize(("robot", "guess"), [(STRETCH, False), (RESTLESS, False), (RESTLESS, True)])
+@pytest.mark.parametrize(
+    ("robot", "guess"), [(STRETCH, False), (TRAILING, False), (RESTLESS, False), (RESTLESS, True)]
+)
 def test_where_a_robot_stands_is_no_use_while_another_goal_is_due_before(robot, guess):
     """It begins where it has to be from step 60 on, and has to be elsewhere by then. Neither there nor on its
     way back may it wait before the door that is shut. A robot that cannot wait turns on the spot meanwhile.
+    One that cannot back out, and whose footprint trails, cannot turn any more once it has driven up to the
+    door, as the tables lead it.
     """
     task, body = two_rooms("F[0,60] East and F[60,110] West", robot)
     pose = np.array([0.7, 1.5, 0.0])

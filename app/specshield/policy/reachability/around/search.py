@@ -93,17 +93,22 @@ def go_around(
     tree = make_tree(most, guide.rules.kind.shape[0])
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))
     copy_progress(now.status, now.run, scratch.status, scratch.run)
-    n, outcome = 0, FAILED
+    n, outcome, reached, status, run = 0, FAILED, 0, now.status.copy(), now.run.copy()
     for _ in range(LEGS):
         here = led[n - 1] if n > 0 else now.pose
         found = _reach(guide, fields, t + n, steps - n, here, tree, scratch)
+        if found == NO_WAY and n > reached:  # the climb led a robot that cannot back out up to an obstacle
+            n = reached
+            copy_progress(status, run, scratch.status, scratch.run)
+            continue
         if found < 0:
             return int(found)
         length = tree.made[found]
         trace(tree, found, way[n:])
         simulate(guide.body, here, way[n : n + length], led[n : n + length])
-        n += length
-        copy_progress(tree.status[found], tree.run[found], scratch.status, scratch.run)
+        n = reached = n + length
+        copy_progress(tree.status[found], tree.run[found], status, run)
+        copy_progress(status, run, scratch.status, scratch.run)
         if guide.wait < 0:
             outcome, n = _linger(guide, t, n, way, led, scratch)
             if outcome == STUCK:
