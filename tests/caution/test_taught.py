@@ -366,6 +366,21 @@ def test_a_robot_that_can_come_no_nearer_stands_and_does_not_push_what_is_seen(g
             assert int(STRETCH.motion_of[action]) == STRETCH.wait_motion
 
 
+@pytest.mark.parametrize(
+    ("rule", "poses", "make"),
+    [  # it was nearer before; it was 5 cm inside Start, and the rule cannot be missed by more than that
+        ("F[0,5] Goal", [(1.2, 1.0, 0.0), (1.0, 1.0, 0.0), (0.8, 1.0, 0.0)], synthesise),
+        ("G[0,3] (Start -> F[0,9] Goal)", [START, START], plan),
+    ],
+)
+def test_a_robot_that_will_be_late_goes_on_all_the_same_whatever_its_past_is_worth(rule, poses, make):
+    begin = {"type": "circle", "center": [0.6, 1.0], "radius": 0.05}
+    policy = make(make_task(room().task.grid, STRETCH, rule, {"Goal": GOAL, "Start": begin}))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=Uncertainty()))
+    decision = decide(shield, poses, None, main_task_done=True)
+    assert (decision.mode, decision.action) == ("fallback", AHEAD)
+
+
 @pytest.mark.parametrize("skin", [0.0, 0.02])
 def test_a_robot_whose_scanner_sees_its_own_body_all_round_is_not_shut_in(skin):
     """Points on the footprint's edge, or a little outside: they lie under no more than 3 cm of it."""

@@ -90,8 +90,9 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     warnings that say what that gives up.
 
     If the obstacles in the way may go again, the robot waits for that, as long as it gives up no more by
-    waiting. If no future is better than standing for ever, contacts and the motions that led nowhere are set
-    aside, since they may be the reason. told: the shield on the policy's map; shield: on the session's own.
+    waiting. If no future comes nearer to the first part that is lost than the robot ever was, contacts and
+    the motions that led nowhere are set aside, since they may be the reason. told: the shield on the
+    policy's map; shield: on the session's own.
     """
     if judged.some or not recovers(shield.config):
         return judged
@@ -108,7 +109,7 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and _loses(shield, judged.part, tried, awaited) == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
-    elif not helps:
+    elif not helps[0]:
         known, marked, ways = taught.map, taught.map.occupied & (taught.map.by != SENT), judged.tried
         if marked.any() or len(taught.barred):  # contacts may be the reason
             free = on_map(told, revised(known, forget(known, marked)))
@@ -116,7 +117,7 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
             ways = futures(now.prefix, free.body, asked, None, (0.0,))
             first, _, said, helps = most_kept(free, judged.part, ways.motions)
             said = ("what contacts taught leaves no way, so it is ignored for this action", *said)
-        first = first if helps else ways.preferred
+        first = first if helps[1] else ways.preferred
     tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # only the futures that were judged
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 

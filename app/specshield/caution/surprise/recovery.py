@@ -2,7 +2,8 @@
 
 After a surprise, or once a part of the rule is lost, the other parts are kept: first the safest, which are
 those of the form G, then those that end soonest. Among futures that keep the same parts, the one is chosen
-that comes nearest to the first part given up, since a way to keep that part may still be found later.
+that comes nearest to the first part given up, since a way to keep that part may still be found later. Only
+the steps to come count for that: a robot that has just backed out of something was nearer before.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ def recovers(config: Config) -> bool:
 
 def most_kept(
     shield: Shield, prefix: Prefix, futures: Ints
-) -> tuple[int, tuple[Formula, ...], tuple[str, ...], bool]:
+) -> tuple[int, tuple[Formula, ...], tuple[str, ...], tuple[bool, bool]]:
     """The first motion of the future that keeps most of `prefix.formula`; the parts that it gives up, the
-    safest first; a sentence for each of these; and whether the future is better than standing for ever.
+    safest first; a sentence for each of these; and whether the future comes nearer to keeping the first of
+    them than the robot ever was, and than standing for ever.
 
     futures [N, T - t]: the motions of each.
     """
@@ -38,20 +40,23 @@ def most_kept(
     for motions, poses in zip(futures, whole[:-1], strict=True):
         simulate(shield.body, prefix.poses[-1], motions, poses)
     left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
-    nearest = np.zeros(len(whole))
+    ever = nearest = np.zeros(len(whole))
     safest = sorted(conjuncts(prefix.formula), key=lambda each: (not isinstance(each, Always), each.horizon))
     for part in safest:
-        rho, _ = rho_of(prefix.of(part), whole)
+        asked = prefix.of(part)
+        rho, _ = rho_of(asked, whole)
         keeps = left & (rho > SATISFIED_ABOVE)
         if keeps.any():
             left = keeps
             continue
-        nearest = nearest if said else rho
+        if not said:  # what held at a past step holds there, however little, and what did not does not
+            past = np.where(asked.known > SATISFIED_ABOVE, np.inf, -np.inf)
+            ever, (nearest, _) = rho, rho_of(asked._replace(known=past), whole)
         lost.append(part)
         said.append(f"no way that was tried keeps {part}: the best misses it by {abs(rho[left].max()):.3g}")
-    nearest = np.where(left, nearest, -np.inf)
+    ever, nearest = (np.where(left, each, -np.inf) for each in (ever, nearest))
     best = int(np.argmax(nearest[:-1]))
-    better = bool(nearest[best] > nearest[-1] + BETTER)
+    better = bool(ever[best] > ever[-1] + BETTER), bool(nearest[best] > nearest[-1] + BETTER)
     return int(futures[best, 0]), tuple(lost), tuple(said), better
 
 
