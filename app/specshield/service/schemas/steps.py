@@ -144,8 +144,8 @@ class StepResponse(BaseModel):
     margin: float = Field(description="The robustness above 0 that J asked for at this step [m].")
     slack: int = Field(description="The reserve before deadlines that J asked for at this step [steps].")
     threshold_left: float = Field(
-        description="The threshold of the next step. With `threshold_over` `episode` it changes, and is a share "
-        "of the best chance that the next step has."
+        description="The threshold of the next step. With `threshold_over` `episode` it changes, and is a "
+        "share of the best chance that the next step has."
     )
     map_revision: int = Field(
         description="How often the session's own map has changed; 0: it equals the policy's map."
