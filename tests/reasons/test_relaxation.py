@@ -167,6 +167,16 @@ def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
     assert (found.conjuncts[0].late_by, found.conjuncts[0].feasible_alone) == (1, False)
 
 
+@pytest.mark.parametrize("heading", [1, 2, 3])
+def test_a_place_that_some_of_every_square_may_be_in_is_gone_to(heading):
+    """Squares of 0.2 m: those on the left of the edge reach over it, by the circles that bound them."""
+    cells = Cells("G[0,5] F[0,5] x >= 0.2", None, {})
+    shield, history = make_shield([Scripted(cells, waits)]), np.array([cells.pose(0, 2, heading)])
+    found = way(shield, history, {})
+    assert found is not None
+    assert (driven(shield, history, found[None])[0, 5:, 0] >= 0.2).all()
+
+
 def test_two_places_that_can_just_be_visited_in_time_are():
     """A step later the search met the first place too late, took that for a way, and looked no further."""
     turns = [("go", 0.2, 0.0), ("left", 0.0, math.pi / 6), ("right", 0.0, -math.pi / 6)]

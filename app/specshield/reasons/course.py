@@ -11,7 +11,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats
 from specshield.reasons.ground import Ground
 from specshield.reasons.known import Known
-from specshield.reasons.needs import Need
+from specshield.reasons.needs import Need, positive
 from specshield.stl import SATISFIED_ABOVE, And, Formula
 
 MOST_NEEDS = 24  # that are looked at; each is compared with all others
@@ -54,19 +54,13 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
                 return f"{need.formula} asks for '{asked}', which holds nowhere that the robot fits"
         where = possible(_together(need, guards, need.end), ground)
         begun = need.first == need.last == known.now + 1
-        everywhere = np.array_equal(where, ground.free) and not _turns(need.predicate, known)
+        # A predicate that only may hold in every square is to be gone to: a square may lie across its edge.
+        everywhere = not possible(positive(need.predicate, True), ground).any()
         if not begun and not everywhere:
             found.append((need, where))
     found = sorted(found, key=lambda goal: int(goal[1].sum()))
     goals = (Goal(need, where, _far(need, where, guards, known.now, ground, late)) for need, where in found)
     return Course(guards, tuple(goals))
-
-
-def _turns(predicate: Formula, known: Known) -> bool:
-    """Whether a predicate may depend on the heading, of which a square says nothing."""
-    areas = known.task.areas
-    carried = any(areas[name].point != (0.0, 0.0) for name in predicate.names if name in areas)
-    return carried or "theta" in predicate.names
 
 
 def possible(predicate: Formula, ground: Ground) -> Bools:
