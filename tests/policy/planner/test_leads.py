@@ -8,12 +8,14 @@ import numpy as np
 
 from specshield.caution.taught import Taught
 from specshield.episode import Config, decide, make_shield
+from specshield.policy.planner.method import Settings
 from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import step
 from specshield.service.heavy.tables import make
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.policy.planner.worlds import cells_of
 
 
 def test_a_closed_door_is_driven_around_once_there_are_fields_for_the_learned_map():
@@ -38,3 +40,14 @@ def test_a_closed_door_is_driven_around_once_there_are_fields_for_the_learned_ma
         assert decision.reason is None
     assert decision.spec_status == "satisfied"
     assert any(y > 4.7 for _, y, _ in poses)
+
+
+def test_after_an_until_is_broken_its_left_side_keeps_no_way_back():
+    """The place is five motions away, and five steps are left. Neither A nor B holds on the way."""
+    places = {"A": (0, 0), "B": (2, 0)}
+    for rule, status in (("F[0,8] B and (A or B) U[5,6] B", "violated"), ("F[0,8] B", "pending")):
+        cells = cells_of(rule, places=places)
+        shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+        decision = decide(shield, [cells.pose(0, 2, 0)] * 4, np.zeros(5))
+        assert (decision.spec_status, decision.reason) == (status, None)
+        assert decision.distribution[1:4].tolist() == [0.0, 0.0, 0.0]

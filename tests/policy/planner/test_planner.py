@@ -82,6 +82,11 @@ WORLDS = {
         lambda s: s["A"][..., 2:5].all(-1) & ~s["A"][..., 5:].any(-1),
         {"A": (2, 2)},
     ),
+    "a dwell, then on": Cells(
+        "G[0,4] (A or C) and F[0,7] B",
+        lambda s: (s["A"] | s["C"])[..., :5].all(-1) & s["B"].any(-1),
+        {"A": (2, 2), "B": (2, 1), "C": (1, 2)},
+    ),
 }
 EACH = pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
 STARTS = [(i, j, h) for i, j in ((0, 0), (0, 1), (1, 2), (2, 1), (2, 2)) for h in range(4)]

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from specshield.arrays import Codes, Int32s
+from specshield.arrays import Codes, Int32s, Ints
 from specshield.policy.lattice import INVALID, STEP_CODES, make_lattice, number_cells
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds
 from specshield.policy.planner.fields import Fields, holding, steps_to
-from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
+from specshield.policy.planner.literals import LAST, PackedLiterals, literals_of
 from specshield.robot.dynamics import make_body
 from specshield.stl import Always, Eventually, Implies, Not, Or, conjuncts
 from specshield.task import Task
@@ -33,9 +33,12 @@ def make_fields(
     used = free.any(axis=2)
     codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
     chosen = np.full((len(literals), 2), -1, np.int32)
-    for column, kept in enumerate(_kept(task, packed, literals)):
+    lasting = _lasting(task, packed)
+    for column in (0, 1):
         for k in range(len(literals)):
-            keeps = tuple(g for g in kept if literals[g].predicate != literals[k].predicate)
+            others = [g for g in range(len(literals)) if literals[g].predicate != literals[k].predicate]
+            kept = lasting >= packed.literal[k, LAST]  # as long as the goal may be asked for
+            keeps = tuple(g for g in others if kept[g] or (column == 1 and literals[g].guards))
             if (k, keeps) not in codes and len(codes) < MAX_FIELDS:
                 allowed = free.copy()
                 for g in keeps:  # the left of an `until` need not hold where the right does
@@ -66,9 +69,9 @@ def make_fields(
     return Fields(cell, code, pitch), chosen
 
 
-def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
-    """The literals that every way to a goal keeps; and these with those that may have to hold for a while.
-    The former have to hold, whatever else happens, at half of all steps or more.
+def _lasting(task: Task, packed: PackedLiterals) -> Ints:
+    """The step up to which each literal has to hold at every step from 1 on, whatever else happens; 0 if it
+    need not hold at step 1. Shape [L].
     """
     tree = packed.formula.tree
     bounds = make_bounds(tree.size)
@@ -76,9 +79,10 @@ def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> 
     for n in np.flatnonzero(packed.leaf[:, 0] < 0):  # the signals may be anything
         span = slice(tree.leaf_at[n], tree.leaf_at[n] + tree.leaf_stop[n] - tree.leaf_start[n])
         bounds.low[span], bounds.high[span] = -np.inf, np.inf
-    always = []
-    for k in range(len(literals)):
-        needed = [not is_open_if(packed, k, -1, -1, t, t, bounds) for t in range(task.horizon + 1)]
-        if 2 * sum(needed) >= len(needed):
-            always.append(k)
-    return always, [k for k in range(len(literals)) if k in always or literals[k].guards]
+    lasting = np.zeros(len(packed.literal), np.int64)
+    for k in range(len(lasting)):
+        for t in range(1, task.horizon + 1):
+            if is_open_if(packed, k, -1, -1, t, t, bounds):
+                break
+            lasting[k] = t
+    return lasting
