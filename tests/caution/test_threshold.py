@@ -252,6 +252,21 @@ def test_a_robot_that_cannot_steer_meets_the_walls_of_a_corridor_as_often_as_noi
     assert expected - 0.01 <= values[0] <= expected
 
 
+def test_an_earlier_way_is_found_where_all_ways_at_hand_are_just_in_time():
+    """Forward, right, forward meets B by 2 mm in three steps, with a fourth to spare: a probability of 0.65.
+    Deeper in B the same takes all four, as does waiting first.
+    """
+    turns = [{"name": "left", "rotate": math.pi / 4}, {"name": "right", "rotate": -math.pi / 4}]
+    actions = [{"name": "forward", "translate": 0.25}, *turns, {"name": "wait"}]
+    robot = robot_from_json({"footprint": {"radius": 0.15}, "actions": actions})
+    place = {"B": {"type": "circle", "center": [0.6719783804, 1.6322866697], "radius": 0.25}}
+    task = make_task(OccupancyGrid(np.zeros((24, 24), bool), 0.1), robot, "F[0,4] B", place)
+    config = Config(uncertainty=Uncertainty(0.0, 0.0, 0.3), threshold=0.8, threshold_over="episode")
+    shield = make_shield([synthesise(task)], config)
+    found = decide(shield, [(1.3735920554, 1.5230849802, -2.8873782581)], [0.0, 0.0, 0.0, 3.0])
+    assert found.distribution.tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize("over", ["step", "episode"])
 def test_asking_for_all_over_the_episode_keeps_as_much_in_hand_as_asking_at_each_step(over):
     """The robot is off its way at each step, and its model has no goal. V alone lets time go by: it is as

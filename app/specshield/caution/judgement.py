@@ -188,8 +188,8 @@ def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[
     """
     unsure = shield.config.uncertainty is not None
     if unsure and shield.config.threshold_over == "episode":  # V weighs ways with any slack
-        chancy = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
-        return chancy if some else [], True
+        less = [*range(care.least, most + 1, -LESS), *range(most, max(most - LESS, 0), -1)]
+        return [most + 1, *(less if some else ())], True  # all ways at hand may be later than need be
     if unsure and t > 0 and not care.on_way and most < care.least:  # a surprise may have cost slack
         return [most + 1], True
     return [most] if some and most > 0 and care.on_way else [], False
