@@ -35,7 +35,7 @@ class LearnedMap:
 
     cell [N]: row * width + column, ascending. occupied [N]: on the session's map; the policy's map has the
     opposite. by [N]: SENT, CONTACT, LEFT, RIGHT or BEHIND. step [N]: at which each was seen last. revision:
-    how often a cell has changed; a step may change some more than once.
+    how often cells have changed, which may be more than once in a step.
     """
 
     revision: int = 0
