@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import deadlines
 from specshield.episode import decide, make_shield, start
+from specshield.policy.notices import may_begin
 from specshield.policy.planner.due_dates import NO_DATE
 from specshield.policy.planner.exact import _reach
 from specshield.policy.planner.first_motions import make_way
@@ -19,7 +20,7 @@ from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
-from tests.oracles.cells import STATES, WALLS, Cells
+from tests.oracles.cells import CELL, ROBOT, STATES, WALLS, Cells
 from tests.policy.rooms import OCCUPIED, REGIONS, flat
 
 ROOM = OccupancyGrid(np.pad(np.zeros((48, 48), bool), 1, constant_values=True), 0.1)
@@ -112,3 +113,19 @@ def test_poses_that_break_the_rule_take_no_room():
     assert length == -1
     assert made > 20
     assert (tree.table >= 0).sum() == made - 1  # all but x_t
+
+
+def begins_in_a_corridor(rule, heading):
+    """Of four cells, A to B, and 2 cm wider than the robot: nowhere on the lattice's points does it fit."""
+    corridor = OccupancyGrid(np.zeros((1, 4), bool), CELL)
+    places = {"A": ([0.0, 0.0], [CELL, CELL]), "B": ([3 * CELL, 0.0], [4 * CELL, CELL])}
+    regions = {name: {"type": "rectangle", "min": low, "max": high} for name, (low, high) in places.items()}
+    shield = make_shield([synthesise(make_task(corridor, ROBOT, rule, regions))])
+    return may_begin(shield, [CELL / 2, CELL / 2, math.remainder(heading * math.pi / 2, math.tau)])
+
+
+@pytest.mark.parametrize("heading", range(4))
+def test_a_passage_hardly_wider_than_the_robot_is_gone_through(heading):
+    needed = 3 + min(heading, 4 - heading)
+    assert begins_in_a_corridor(f"G[0,6] (A -> F[0,{needed}] B)", heading)
+    assert not begins_in_a_corridor(f"G[0,6] (A -> F[0,{needed - 1}] B)", heading)

@@ -5,6 +5,9 @@ astray, too many near a deadline. Here every pose that the robot's motions can r
 Nilsson and Raphael, 1968): first those with the least sum of the steps so far and the steps to go. The fields
 give the steps to go; poses that are too late by more than the fields err are left out. Of poses that are
 nearly the same, the one that is reached in the fewest steps counts.
+
+A passage hardly wider than the robot may lie between the points of the lattice. A pose from which the field
+knows no way counts as near to the goal as the pose before it.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from specshield.arrays import Ints
 from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.due_dates import NO_DATE, read_pose
-from specshield.policy.planner.fields import to_go_at
+from specshield.policy.planner.fields import OUT_OF_REACH, to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
 from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
 from specshield.policy.tree import DEGREE, Grain, Tree, enter, make_tree, pop, push, put, trace
@@ -29,6 +32,7 @@ RICH = 100_000  # poses: with fewer left to try, only the first grain is tried. 
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
 DEEPER = 1e-3  # [steps] the advantage, for each step made, of a pose farther on its way over one as good
+UNSEEN = 10_000  # poses, at most, where the field knows no way from the first one: enough for a small floor
 LEGS = 8  # literals that one way may go to by such searches, one after the other
 
 
@@ -86,11 +90,15 @@ def _reach(
     body = world.body
     tree.table[:] = -1
     put(tree, 0, way.poses[n, 0], way.poses[n, 1], way.poses[n, 2], 0, -1, -1)
-    count, size = 1, push(tree.heap, 0, 0, 0.0)
+    ahead = to_go_at(body, world.fields, f, way.poses[n, 0], way.poses[n, 1], way.poses[n, 2])
+    seen = ahead < OUT_OF_REACH
+    most = most if seen else min(most, UNSEEN)
+    count, size = 1, push(tree.heap, 0, 0, OPTIMISM * ahead if seen else 0.0)
     while size > 0 and count + motion_count(body) <= most:
-        here = tree.heap.row[0]
+        here, rank = tree.heap.row[0], tree.heap.rank[0]
         size = pop(tree.heap, size)
         made = tree.made[here] + 1
+        from_here = (rank - (1.0 - DEEPER) * (made - 1)) / OPTIMISM
         if n + made > stop:
             continue
         x0, y0, theta0 = tree.pose[here, 0], tree.pose[here, 1], tree.pose[here, 2]
@@ -100,6 +108,7 @@ def _reach(
             if (x == x0 and y == y0 and theta == theta0) or is_barred(world.barred, x0, y0, theta0, m):
                 continue
             ahead = to_go_at(body, world.fields, f, x, y, theta)
+            ahead = ahead if ahead < OUT_OF_REACH else from_here
             if n + made + ahead > stop + ASTRAY:
                 continue
             put(tree, count, x, y, theta, made, here, m)
