@@ -129,3 +129,8 @@ def test_a_passage_hardly_wider_than_the_robot_is_gone_through(heading):
     needed = 3 + min(heading, 4 - heading)
     assert begins_in_a_corridor(f"G[0,6] (A -> F[0,{needed}] B)", heading)
     assert not begins_in_a_corridor(f"G[0,6] (A -> F[0,{needed - 1}] B)", heading)
+
+
+def test_a_place_is_gone_to_late_where_it_begins_what_cannot_be_answered():
+    assert begins_in_a_corridor("F[0,7] B and G[0,6] (B -> F[0,1] A)", 0)
+    assert not begins_in_a_corridor("F[0,6] B and G[0,6] (B -> F[0,1] A)", 0)

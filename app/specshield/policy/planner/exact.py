@@ -17,10 +17,10 @@ import numpy as np
 from specshield.arrays import Ints
 from specshield.caution.surprise.barred import is_barred
 from specshield.compiled import kernel, leaf
-from specshield.policy.planner.due_dates import NO_DATE, read_pose
+from specshield.policy.planner.due_dates import NO_DATE, foresee, is_open, read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
-from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
+from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at, stay
 from specshield.policy.tree import DEGREE, Grain, Tree, enter, make_tree, pop, push, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
 
@@ -39,7 +39,9 @@ LEGS = 8  # literals that one way may go to by such searches, one after the othe
 @kernel
 def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: int) -> bool:
     """Goes to one literal after the other by searches over exact poses, and after each calls `search` for the
-    rest of the way. To be called right after `search` from x_t has failed; the result is that of `search`.
+    rest of the way. If that fails, it is called for the same way after waits, which ends just in time: what
+    begins at the literal begins later then, as a response does. To be called right after `search` from x_t
+    has failed; the result is that of `search`.
 
     most: how many poses the searches for all legs may make.
     """
@@ -76,7 +78,26 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
             return False
         if search(world, way, nodes, n, effort):
             return True
+        went, late = way.motions[before:n].copy(), stop - n if world.stands else 0
+        open_late = late > 0 and _is_open_after(world, way, before, late, went)
+        if open_late and search(world, way, nodes, stop, effort):
+            return True
+        _is_open_after(world, way, before, 0, went)
     return False
+
+
+@leaf
+def _is_open_after(world: World, way: Way, n: int, waits: int, motions: Ints) -> bool:
+    """Goes on from motions[:n]: waits so many steps, then makes `motions`. Returns whether the formula can
+    still be satisfied then, as far as the bounds can tell.
+    """
+    stay(world, way, n, n + waits)
+    n += waits
+    for motion in motions:
+        move(world, way, n, motion)
+        n += 1
+    foresee(world.literals, way.t + n, way.known, way.held, way.bounds)
+    return is_open(world.literals, way.bounds)
 
 
 @leaf
