@@ -28,7 +28,9 @@ def policy(
     regions: Annotated[Path | None, typer.Option(help="JSON or YAML file of your own places.")] = None,
     robot: Annotated[str, typer.Option(help="A preset, or a JSON or YAML file.")] = "stretch",
     assets: Annotated[Path | None, typer.Option(help="JSON or YAML file of furniture sizes.")] = None,
-    method: Annotated[str, typer.Option(help="reachability, planner or dqn.")] = "reachability",
+    method: Annotated[
+        str, typer.Option(help="reachability, planner, dqn, or one of another package.")
+    ] = "reachability",
     name: Annotated[str | None, typer.Option(help="A name for the policy.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
     url: Annotated[str | None, typer.Option(help=URL_HELP)] = None,

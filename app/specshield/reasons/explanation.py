@@ -81,8 +81,14 @@ class _Motion:
             if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
                 break  # all further futures are as late or later
             poses = driven(self.shield, self.prefix.poses, rows)
-            held = (self.prefix.foreseen, np.concatenate([self.prefix.rows, self.prefix.rows[-1:]]))
-            samples, calm = (task.samples(poses, dict(zip(task.signals, v.T, strict=True))) for v in held)
+            samples = task.samples(poses, dict(zip(task.signals, self.prefix.foreseen.T, strict=True)))
+            sent = dict(zip(task.signals, self.prefix.rows.T, strict=True))
+            calm = {
+                name: np.broadcast_to(task.signal(name, sent, values.shape[-1]), values.shape)
+                if name in task.signals
+                else values
+                for name, values in samples.items()
+            }
             rho = np.array([values_of(part, samples) for part in parts])  # [parts, rows]
             asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evaluation.worlds.robots import ROBOTS
 from specshield.caution.surprise.barred import NOTHING_BARRED, in_vain
 from specshield.compiled import box
 from specshield.policy.progress import PENDING, SETTLED, make_rules, pasts
@@ -122,18 +123,7 @@ EAST = {"type": "rectangle", "min": [3.0, 1.0], "max": [3.9, 2.0]}
 
 
 RESTLESS = replace(STRETCH, name="restless", actions=STRETCH.actions[:4])  # ahead, right, left, back
-TRAILING = robot_from_json(
-    {
-        "footprint": {"radius": 0.18, "offset": [-0.08, 0.0]},
-        "on_contact": "stop",
-        "actions": [
-            {"name": "on", "translate": 0.25},
-            {"name": "left", "rotate": 0.5236},
-            {"name": "right", "rotate": -0.5236},
-            {"name": "wait"},
-        ],
-    }
-)
+TRAILING = ROBOTS["trailing"]
 
 
 def two_rooms(formula, robot=STRETCH):

@@ -32,7 +32,9 @@ RICH = 100_000  # poses: with fewer left to try, only the first grain is tried. 
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
 DEEPER = 1e-3  # [steps] the advantage, for each step made, of a pose farther on its way over one as good
-UNSEEN = 10_000  # poses, at most, where the field knows no way from the first one: enough for a small floor
+# poses, at most, where the field knows no way from the first one: enough for a small floor. To refuse a start
+# in a closed room took 220 ms without this bound, and 16 ms with it (own script).
+UNSEEN = 10_000
 LEGS = 8  # literals that one way may go to by such searches, one after the other
 
 
