@@ -162,15 +162,21 @@ def uncertainty(
     page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/results/uncertainty.md"),
     processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
 ) -> None:
-    """Measure sessions whose robot or map is not as they were told, and write the page of it."""
-    from evaluation.uncertainty.figures import carry_out
+    """Measure sessions whose robot or map is not as they were told, and write the page of it.
+
+    What is not measured now stays on the page as it was: its figures are kept beside it.
+    """
+    from evaluation.uncertainty.figures import beside, carry_out, keep_beside
     from evaluation.uncertainty.page import write
     from evaluation.uncertainty.plan import PARTS
 
     _check_page(page)
     parts = _some(only, PARTS, "--only") if only else []
+    before = beside(page)
     found, failed = carry_out(out, parts, share, seed, processes or cores())
+    found = {**before, **found}
     write(page, found, seed)
+    keep_beside(page, found)
     raise typer.Exit(1 if failed else 0)
 
 

@@ -1,4 +1,6 @@
-"""Runs campaigns, each as the command that it is, and keeps what they print: a file of JSON for each."""
+"""Runs campaigns, each as the command that it is, and keeps what they print: a file of JSON for each, and one
+beside the page that is written from them.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +9,21 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from evaluation.uncertainty.plan import Campaign, plan
+from specshield.errors import InputError
 from specshield.policy.tensors import replace_file
 from specshield.sim.progress import duration
 
 ROOT = Path(__file__).resolve().parents[2]
+T = TypeVar("T")
 Table = list[dict[str, str]]  # rows, each by the heads of its columns
 
 
@@ -32,6 +39,9 @@ class Measured:
     @property
     def runs(self) -> int:
         return int(self.command.split()[-1])
+
+
+ONE, ALL = TypeAdapter(Measured), TypeAdapter(dict[str, Measured])
 
 
 def carry_out(
@@ -60,7 +70,32 @@ def kept_in(out: Path) -> dict[str, Measured]:
 
 def read(out: Path, name: str) -> Measured | None:
     path = out / f"{name}.json"
-    return Measured(**json.loads(path.read_text())) if path.exists() else None
+    return _checked(ONE, path) if path.exists() else None
+
+
+def beside(page: Path) -> dict[str, Measured]:
+    """The figures from which a page was written, by the names of their campaigns; none if there is no page.
+
+    So a part of the plan can be measured anew, and the rest of the page stays as it is.
+    """
+    file = page.with_suffix(".json")
+    return _checked(ALL, file) if file.exists() else {}
+
+
+def keep_beside(page: Path, found: Mapping[str, Measured]) -> None:
+    """Keeps the figures from which a page was written, as `beside` reads them."""
+    replace_file(page.with_suffix(".json"), ALL.dump_json(dict(found), indent=1) + b"\n")
+
+
+def _checked(kind: TypeAdapter[T], file: Path) -> T:
+    try:
+        return kind.validate_json(file.read_bytes())
+    except ValidationError as error:
+        raise InputError(
+            f"the file does not hold the figures of campaigns ({error.errors()[0]['msg']})",
+            path=str(file),
+            expected="what `python -m evaluation uncertainty` has written; remove it to measure them anew",
+        ) from error
 
 
 def run(campaign: Campaign, share: float, out: Path, processes: int) -> bool:

@@ -12,7 +12,8 @@ from evaluation.uncertainty.sections import Found, sections
 INTRODUCTION = """\
 # A world that is not as told, measured
 
-Written by `python -m evaluation uncertainty`, which runs the commands below and keeps what they print.
+Written by `python -m evaluation uncertainty`, which runs the commands below and keeps what they print
+([uncertainty.json](uncertainty.json)). With `--only` a part is measured anew and the rest stays.
 [Uncertainty](../uncertainty.md) says what a session does in such worlds, and what its bounds assume. All
 sessions have the default settings, but where a row says `"none"`: nobody set a margin or a slack by hand. The
 rule is judged on true poses. Shares have 95 % Clopper-Pearson intervals; the KL of a run, in nats, has the

@@ -3,11 +3,14 @@
 import json
 
 import pytest
+import typer
 
+from evaluation.commands import uncertainty
 from evaluation.uncertainty import figures, page, plan
 from evaluation.uncertainty.aims import shortfalls
 from evaluation.uncertainty.figures import Measured, tables
 from evaluation.uncertainty.plan import Campaign
+from specshield.errors import InputError
 
 EVALUATED = """\
 case1, gaussian, model goal-seeker, seed 0: F[0,60] A
@@ -156,3 +159,27 @@ def test_the_plan_names_each_campaign_once_and_shortens_it():
     assert {each.part for each in found} == set(plan.PARTS)
     assert all("--seed 3" in each.words for each in found)
     assert found[0].command(0.1).endswith("--methods ours,ours@default --seed 3 --runs 20")
+
+
+def test_a_part_is_measured_anew_and_the_rest_of_the_page_stays(found, tmp_path):
+    path, out = tmp_path / "page.md", tmp_path / "out"
+    page.write(path, found)
+    figures.keep_beside(path, found)
+    before = path.read_text()
+    mended = tables(SWITCHES.replace("BROKEN | 0 | 1 | 0 | 1", "BROKEN | 0 | 0 | 0 | 0"))
+    newer = Measured("python -m benchmarks.switches --seed 0 --switches 200", "abcdef1", "2026-11-30", mended)
+    out.mkdir()  # it holds what was measured anew, so that nothing is run
+    (out / "switches.json").write_bytes(figures.ONE.dump_json(newer))
+    with pytest.raises(typer.Exit):
+        uncertainty("switches", 1.0, 0, out, path, 1)
+    lines = set(path.read_text().splitlines())
+    gone = [line for line in before.splitlines() if line not in lines]
+    assert any("BROKEN" in line for line in gone)
+    assert not [line for line in gone if "MuJoCo" in line or "case1" in line or "until" in line]
+    assert figures.beside(path) == {**found, "switches": newer}
+
+
+def test_figures_that_something_else_wrote_are_refused(tmp_path):
+    (tmp_path / "page.json").write_text('{"mujoco": {"command": 1}}')
+    with pytest.raises(InputError, match=r"page\.json.*remove it to measure them anew"):
+        figures.beside(tmp_path / "page.md")
