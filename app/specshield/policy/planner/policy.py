@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save as save_tensors
 
-from specshield.arrays import Floats, Int32s
+from specshield.arrays import Bools, Floats, Int32s
 from specshield.caution.residual import all_of
 from specshield.caution.surprise.barred import NOTHING_BARRED
 from specshield.caution.worst import moved, worst_signals
@@ -35,6 +35,7 @@ from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import cost_of
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields
 from specshield.policy.planner.first_motions import plan_all
+from specshield.policy.planner.hurry import hurried
 from specshield.policy.planner.leads import MAX_ENTRIES, MAX_FIELDS, make_fields
 from specshield.policy.planner.literals import leading, literals_of, released
 from specshield.policy.planner.method import Settings
@@ -69,8 +70,8 @@ class PlannerPolicy(Carded):
     keeps what has to hold for a while; -1 for none. If another part asks for what begins a response, the
     same again, but with fields that lead there to where the answer is nearest. foreseen [S]: the values of
     the signals from x_{t+1} on; None: their last values. share: of the effort that the settings allow. rest:
-    the formula that is planned for if parts are given up. again: the same with fields for another map, see
-    `remade`.
+    the formula that is planned for if parts are given up. early [steps]: by how much deadlines come earlier.
+    again: the same with fields for another map, see `remade`.
     """
 
     settings: Settings
@@ -79,6 +80,7 @@ class PlannerPolicy(Carded):
     foreseen: Floats | None = None
     share: float = 1.0
     rest: Formula | None = None
+    early: int = 0
     again: PlannerPolicy | None = None
 
     @cached_property
@@ -112,6 +114,12 @@ class PlannerPolicy(Carded):
         if not (chosen := self.chosen[:, 2:]).size:
             return self
         return replace(self, chosen=chosen)._in(self._world._replace(field=chosen.astype(np.int64)))
+
+    def earlier(self, steps: int, wanted: Bools) -> PlannerPolicy:
+        """The policy for deadlines that come so many steps earlier, with less effort a plan; itself unless a
+        way after each first motion is `wanted` [M], since a plan for some costs as much.
+        """
+        return replace(self, share=GUESSED, early=steps)._in(self._world) if wanted.all() else self
 
     def giving_up(self, lost: tuple[Formula, ...]) -> PlannerPolicy:
         """The policy for its rule without these parts: it proposes one way alone, with less effort."""
@@ -169,6 +177,8 @@ class PlannerPolicy(Carded):
             parts = chain((part for part in left if part.horizon > t), parts)
         for part in chain.from_iterable(dict.fromkeys((released(each), each)) for each in parts):
             asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
+            if self.early:
+                asked = tuple(hurried(self.task, each, self.early, history, rows) for each in asked)
             worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
             plans = [self._plan_in(world, history, rows, margin, most) for world in worlds]
             found = any(found for _, found in plans)

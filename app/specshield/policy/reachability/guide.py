@@ -105,32 +105,45 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
 
 def hurried(guide: Guide, margin: float, early: int, past: Past) -> tuple[Guide, bool]:
     """The guide for deadlines that come `early` steps earlier, and whether any does: those of each F that is
-    open at step t and can still be met so early. A window keeps at least half its length. For a robot that
-    cannot wait, no deadline comes earlier. margin [m]: by which x_0..x_t has settled what it has.
+    open at step t and can still be met so early, and the begin of each G to come that does not hold at x_t.
+    The window of an F keeps at least half its length. For a robot that cannot wait, no deadline comes
+    earlier. margin [m]: by which x_0..x_t has settled what it has.
     """
     if guide.wait < 0:
         return guide, False
-    rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
+    a, b, c1 = guide.rules.a.copy(), guide.rules.b.copy(), guide.rules.c1.copy()
+    rules = guide.rules._replace(a=a, b=b, c1=c1)
     now = Rules(*guide.rules[:-2], guide.rules.signals.copy(), margin)
-    least, sooner = _hasten(now, early, past, rules.b, rules.c1)
+    least, sooner = _hasten(now, early, past, a, b, c1)
     return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), sooner
 
 
 @kernel
-def _hasten(rules: Rules, early: int, past: Past, b: Ints, c1: Ints) -> tuple[int, bool]:
-    """Brings the ends b, c1 (K,) of open F forward; the least change [steps], and whether there is any."""
-    now = recall(rules, past)
+def _hasten(rules: Rules, early: int, past: Past, a: Ints, b: Ints, c1: Ints) -> tuple[int, bool]:
+    """Brings the ends b, c1 (K,) of open F and the begins a (K,) of G forward; the least change [steps], and
+    whether there is any.
+    """
+    now, scratch = recall(rules, past), make_scratch(rules, 1)
+    x, y, theta = now.pose
     least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):
-        dwells = rules.kind[k] == EVENTUALLY_ALWAYS
-        end = rules.c1[k] if dwells else rules.b[k]
-        sooner = end - min(early, (end - rules.a[k]) // 2)
-        if now.status[k] != PENDING or rules.kind[k] == ALWAYS or sooner + rules.c2[k] <= now.t:
+        kind, begin, end = rules.kind[k], rules.a[k], rules.b[k]
+        if now.status[k] != PENDING:
             continue
-        if dwells:
-            c1[k] = sooner
+        if kind == ALWAYS:
+            sooner = max(begin - early, now.t + 1)
+            if sooner >= begin or predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
+                continue
+            end, a[k] = begin, sooner
         else:
-            b[k] = sooner
+            end = rules.c1[k] if kind == EVENTUALLY_ALWAYS else end
+            sooner = end - min(early, (end - begin) // 2)
+            if sooner + rules.c2[k] <= now.t:
+                continue
+            if kind == EVENTUALLY_ALWAYS:
+                c1[k] = sooner
+            else:
+                b[k] = sooner
         least = min(least, end - sooner) if met else end - sooner
         met, moved = True, moved or sooner < end
     return least, moved
