@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from specshield import episode
 from specshield.arrays import Floats
-from specshield.client.models import Pose, SpecStatus
+from specshield.client.models import SpecStatus
 from specshield.episode.handover import rule_told
 from specshield.errors import InputError
 from specshield.shield.decision import Shield
@@ -43,28 +41,23 @@ class Rule:
         settings = replace(config, seed=config.seed - self.origin + origin, max_steps=last - origin)
         return Rule(policy, policy.configured(settings, shaping), t, origin, clock)
 
-    def since(self, poses: Sequence[Pose]) -> Floats:
-        """The poses from the rule's origin on."""
-        return np.array(poses[self.origin :]).reshape(-1, 3)
-
-    def signals(self, held: Mapping[str, Sequence[float]], length: int | None = None) -> dict[str, Floats]:
-        """The samples that the rule reads, from its origin to before step `length`."""
-        return {name: np.array(held[name][self.origin : length]) for name in self.shield.task.signals}
-
-    def verdict(
-        self, poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
-    ) -> tuple[SpecStatus, tuple[float, float]]:
-        if len(poses) <= self.origin:
+    def verdict(self, rows: Floats, names: Iterable[str]) -> tuple[SpecStatus, tuple[float, float]]:
+        """The verdict on a session's rows [n, 3 + signals], and the bounds on the rule's robustness."""
+        if len(rows) <= self.origin:
             return "pending", (-math.inf, math.inf)
-        return episode.close(self.shield, self.since(poses), self.signals(held, len(poses)))
+        since = rows[self.origin :]
+        return episode.close(self.shield, since[:, :3], signals_in(since, names))
 
 
-def told(
-    rules: Sequence[Rule], poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
-) -> tuple[dict[str, Any], ...]:
+def signals_in(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
+    """The samples [n] of each signal in rows [n, 3 + signals]. names: of the signals, by column."""
+    return {name: rows[:, 3 + i] for i, name in enumerate(names)}
+
+
+def told(rules: Sequence[Rule], rows: Floats, names: Sequence[str]) -> tuple[dict[str, Any], ...]:
     """The rules as the contract shows them, each with the verdict on the states to which it led."""
-    seen = [*(poses[: rule.begins + 1] for rule in rules[1:]), poses]
+    seen = [*(rows[: rule.begins + 1] for rule in rules[1:]), rows]
     return tuple(
-        rule_told(rule.policy.about(), rule.begins, rule.origin, rule.clock, rule.verdict(known, held)[0])
+        rule_told(rule.policy.about(), rule.begins, rule.origin, rule.clock, rule.verdict(known, names)[0])
         for rule, known in zip(rules, seen, strict=True)
     )

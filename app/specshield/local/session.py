@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from specshield import episode
+from specshield.arrays import Floats
 from specshield.caution.signals import any_signal
 from specshield.caution.surprise.slip import SAME_POSE
 from specshield.client import wire
@@ -28,7 +29,7 @@ from specshield.client.wire import Logits, Numbers, Points
 from specshield.client.wiring import Wiring
 from specshield.episode import handover
 from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished
-from specshield.local.rule import Rule, told
+from specshield.local.rule import Rule, signals_in, told
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
 from specshield.robot.dynamics import wrap
@@ -56,9 +57,10 @@ class LocalSession:
         shield: Shield,
         shaping: str,
         info: SessionInfo,
-        initial_pose: Pose,
+        rows: Floats,
         way: bytes | None = None,
     ) -> None:
+        """rows [1, 3 + signals]: x_0 and the initial values of the signals."""
         self.info = info
         self.t = 0
         self.spec_status: SpecStatus = info.spec_status
@@ -67,13 +69,11 @@ class LocalSession:
         self._over = False  # whether a server would refuse further steps: it does not know of a drawn `end`
         self._shaping = shaping
         self._rules = [Rule(policy, shield)]
-        self._first = dict(shield.task.signals)
+        self._names = [*shield.task.signals]  # of the signals of all rules, by column of the rows
+        self._rows = rows  # up to x_{t-1}, or to x_t if the beginning or a switch has given it
         self._carry = handover.begun(way)
         self._wiring = Wiring(info.id)
-        self._poses: list[Pose] = []
-        self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
-        self._given = {0: initial_pose}  # x_t of the next step, if the beginning or a switch has given it
 
     @property
     def id(self) -> str:
@@ -89,9 +89,9 @@ class LocalSession:
         return self._rules[-1]
 
     @property
-    def _known(self) -> list[Pose]:
-        """The poses up to x_t if that was given already, else up to x_{t-1}."""
-        return [*self._poses, *(pose for t, pose in self._given.items() if t == self.t)]
+    def _given(self) -> Pose | None:
+        """x_t, if the beginning or a switch has given it."""
+        return _pose(self._rows[self.t]) if len(self._rows) > self.t else None
 
     def __enter__(self) -> LocalSession:
         return self
@@ -124,15 +124,16 @@ class LocalSession:
             wire.seconds_value(deadline, "deadline")
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
-        handover.check_signals(self._first, sent)  # signals of the session's other rules are kept too
+        handover.check_signals(self._names, sent)  # signals of the session's other rules are kept too
         x_t = self._at(pose)
-        held = self._held(sent)
+        rows = self._with(x_t, sent)
+        since = rows[self._rule.origin :]
         made = episode.decide(
             self._rule.shield,
-            self._rule.since([*self._poses, x_t]),
+            since[:, :3],
             None if logits is None else [-math.inf if z is None else z for z in wire.logit_values(logits)],
             over,
-            self._rule.signals(held),
+            signals_in(since, self._names),
             self._carry,
             witnesses,
             None if occupied is None else np.array(wire.point_values(occupied, "occupied")).reshape(-1, 2),
@@ -142,7 +143,7 @@ class LocalSession:
         answer = _answer(made._replace(t=self.t), self.info, over, witnesses, explain)
         self._carry, self._decisions[self.t] = made.carry, answer
         self._wiring.note(self.t, x_t, answer, executed=main_task_done is None)
-        self._arrived(x_t, held)
+        self._arrived(rows)
         self.spec_status = answer.spec_status
         ends = main_task_done is None and answer.action in self.info.terminal_actions
         self.main_task_done, self._told_done = over or ends, over
@@ -158,7 +159,7 @@ class LocalSession:
         if self.closed:
             raise SessionFinished("the session is closed", path="t", got=self.t, expected="a new session")
         x_t = wire.pose_values(pose)
-        self._arrived(self._given.get(self.t, x_t), self._held({}))
+        self._arrived(self._with(self._given or x_t))
 
     def switch(
         self, policy: LocalShield, *, clock: Literal["keep", "restart"] = "keep", pose: Numbers | None = None
@@ -171,23 +172,24 @@ class LocalSession:
         if not isinstance(policy, type(self._rule.policy)):
             wrong = "this is no LocalShield"
             raise InputError(wrong, path="policy", got=policy, expected="a LocalShield")
-        given = self._given.get(self.t) if pose is None else self._at(pose)
+        given = self._given if pose is None else self._at(pose)
         old, made = self._rule, (policy.card["id"], self.t, clock)
         if len(self._rules) > 1 and made == (old.policy.card["id"], old.begins, old.clock):
             return self.info  # the last switch was the same one
         self._check(self.main_task_done)
         x_t = self._foreseen() if given is None else given
         rule = old.followed_by(policy, self._shaping, self.t, clock)
-        first = {**policy.task.signals, **self._first}
-        held = self._held({}, self.t + 1, first)
-        seen, signals = rule.since([*self._poses, x_t]), rule.signals(held)
+        added = {name: value for name, value in policy.task.signals.items() if name not in self._names}
+        names, rows = [*self._names, *added], self._with(x_t)
+        rows = np.hstack([rows, np.tile([*added.values()], (len(rows), 1))])
+        seen, signals = rows[rule.origin :, :3], signals_in(rows[rule.origin :], names)
         same_map = self.info.map_id == policy.task.grid.content_hash
         same_robot = old.policy.card["robot"] == policy.card["robot"]
         t, later = self.t - rule.origin, rule.origin - old.origin
         carry = handover.carried_over(self._carry, same_map, same_robot, t, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
-        known = self._poses if given is None else [*self._poses, x_t]
-        have = told([*self._rules, rule], known, held)
+        rows = rows[: self.t] if given is None else rows
+        have = told([*self._rules, rule], rows, names)
         info = replace(
             self.info,
             **policy.about(),
@@ -200,9 +202,7 @@ class LocalSession:
         )
         self._rules.append(rule)
         self._wiring = Wiring(self.id, self._wiring.said)
-        self._carry, self._first = carry._replace(way=way), first
-        self._given = {} if given is None else {self.t: given}
-        self._signals = {name: values[: self.t] for name, values in held.items()}
+        self._carry, self._names, self._rows = carry._replace(way=way), names, rows
         self.info, self.spec_status, self.finished = info, info.spec_status, False
         return info
 
@@ -223,30 +223,35 @@ class LocalSession:
     def close(self, pose: Numbers | None = None) -> Verdict:
         """End the session. `pose` is the state to which the last action led. Once is enough."""
         if not self.closed and pose is not None:
-            self._arrived(self._at(pose), self._held({}))
-        poses = self._known
-        self.spec_status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
+            self._arrived(self._with(self._at(pose)))
+        self.spec_status, bounds = self._rule.verdict(self._rows, self._names)
         self.closed = self.finished = self._over = True
         low, high = map(handover.finite, bounds)
         return Verdict(self.spec_status, (low, high))
 
     def trajectory(self, after: int = -1) -> tuple[TrajectoryItem, ...]:
         """The states after step `after`, with the answers (the contract's names)."""
-        held = self._held({}, len(self._known))
+        samples = signals_in(self._rows, self._names)
         return tuple(
-            TrajectoryItem(t, pose, {name: held[name][t] for name in reads}, self._told(t), rule)
-            for t, pose in enumerate(self._known)
+            TrajectoryItem(
+                t, _pose(row), {name: float(samples[name][t]) for name in reads}, self._told(t), rule
+            )
+            for t, row in enumerate(self._rows)
             if t > after
             for rule in [max(i for i, each in enumerate(self._rules) if each.begins <= t)]
             for reads in [sorted(self._rules[rule].shield.task.signals)]
         )
 
-    def _arrived(self, x_t: Pose, held: dict[str, list[float]]) -> None:
+    def _with(self, x_t: Pose, sent: Mapping[str, float] | None = None) -> Floats:
+        """The rows up to x_t. A signal that is not sent keeps its last value."""
+        held = dict(zip(self._names, self._rows[-1, 3:].tolist(), strict=True))
+        return np.vstack([self._rows[: self.t], [*x_t, *{**held, **(sent or {})}.values()]])
+
+    def _arrived(self, rows: Floats) -> None:
         """Goes on to step t + 1. After a switch, x_t is also the last state of the rule that was left."""
-        self._poses.append(x_t)
-        self._signals = held
+        self._rows = rows
         if 0 < self.t == self._rules[-1].begins:
-            have = told(self._rules, self._poses, held)
+            have = told(self._rules, rows, self._names)
             self.info = replace(self.info, rules=have, spec_status=have[-1]["spec_status"])
         self.t += 1
 
@@ -262,12 +267,12 @@ class LocalSession:
         if last is None:
             told, expected = f"nothing says where the robot is at step {self.t}", f"its pose at step {self.t}"
             raise HistoryGap(told, path="pose", expected=expected)
-        return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
+        return _pose(self._rows[-1]) if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:
         """x_t. Raises HistoryConflict if the session's beginning, or a switch, gave another x_t."""
         x_t = wire.pose_values(pose)
-        told = self._given.get(self.t, x_t)
+        told = self._given or x_t
         gap = [a - b for a, b in zip(x_t, told, strict=True)]
         if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > SAME_POSE:
             begins = ", its initial_pose" if self.t == 0 else ""
@@ -275,24 +280,14 @@ class LocalSession:
             raise HistoryConflict(conflict, path="pose", got=list(x_t), expected=f"{list(told)}")
         return told
 
-    def _held(
-        self, sent: Mapping[str, float], length: int | None = None, first: Mapping[str, float] | None = None
-    ) -> dict[str, list[float]]:
-        """The samples of the signals for `length` steps, by default up to the step that is decided now. A
-        signal that is not sent keeps its last value, at first that in `first`, by default the rules' own.
-        """
-        n = len(self._poses) + 1 if length is None else length
-        held = {}
-        for name, begins in (self._first if first is None else first).items():
-            values = self._signals.get(name, [])
-            known = values[-1] if values else begins
-            grown = values + [known] * (n - len(values))
-            held[name] = [*grown[:-1], float(sent[name])] if name in sent else grown
-        return held
-
     def _told(self, t: int) -> Mapping[str, Any] | None:
         decision = self._decisions.get(t)
         return None if decision is None else asdict(decision, dict_factory=_contract)
+
+
+def _pose(row: Floats) -> Pose:
+    x, y, theta = row[:3].tolist()
+    return x, y, theta
 
 
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:

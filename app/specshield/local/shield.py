@@ -168,8 +168,9 @@ class LocalShield:
             check_preferring(config)
         shield = self.configured(config, shaping)
         feasible, way = refusal.begin(shield, pose, allowed)
-        held = {name: [value] for name, value in shield.task.signals.items()}
-        rules = told([Rule(self, shield)], [pose], held)
+        signals = shield.task.signals
+        rows = np.array([[*pose, *signals.values()]])
+        rules = told([Rule(self, shield)], rows, [*signals])
         info = SessionInfo(
             id=id,
             **self.about(),
@@ -181,9 +182,9 @@ class LocalShield:
             expires_at="",
             margin=shield.config.margin,
             rules=rules,
-            any_signal=any_signal(shield, np.array([pose], np.float64)),
+            any_signal=any_signal(shield, rows[:, :3]),
         )
-        return LocalSession(self, shield, shaping, info, pose, way)
+        return LocalSession(self, shield, shaping, info, rows, way)
 
     def configured(self, config: Config, shaping: str) -> Shield:
         """The shield with a session's settings."""
