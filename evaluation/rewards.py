@@ -15,12 +15,12 @@ from evaluation.methods import Shielded
 from evaluation.results import markdown
 from evaluation.runs import Record, run_by
 from evaluation.statistics import clopper_pearson, mean_of
+from specshield.commands.train import train
 from specshield.episode import Shield, make_shield, start
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.policy import Policy, load_dqn
 from specshield.policy.reachability.policy import synthesise
 from specshield.shipped import MODELS
-from specshield.sim import training
 from specshield.sim.cases import case_name, case_names, load_case
 from specshield.sim.robot import Pose
 
@@ -69,7 +69,7 @@ class Training:
         folder = self.folder(out)
         if not (folder / "card.json").exists():
             options = [f"reward={self.reward}"]
-            training.train(self.case, "dqn", self.seed, self.updates, options, folder, True)
+            train(self.case, "dqn", self.seed, self.updates, options, folder, True)
         card = json.loads((folder / "card.json").read_text())
         return load_dqn(folder / "policy.safetensors", card, load_case(self.case).task)
 

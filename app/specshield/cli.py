@@ -117,6 +117,7 @@ def _commands() -> Iterator[Callable[..., None]]:
     from specshield.commands.export import export
     from specshield.commands.policy import policy
     from specshield.commands.run import run_policy
+    from specshield.commands.train import train
     from specshield.commands.watch import watch
     from specshield.service.access.commands import app as keys
 
@@ -263,23 +264,6 @@ def demo(
     from specshield.sim.demo import run_demo
 
     raise typer.Exit(run_demo(runs, seed, out, stay))
-
-
-def train(
-    case: Annotated[str, typer.Option(help="A case of maps/, such as 1 or case1.")],
-    method: Annotated[
-        str, typer.Option(help="reachability, planner, dqn, or one of another package.")
-    ] = "reachability",
-    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 0,
-    updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
-    option: Annotated[list[str] | None, typer.Option(help="An option, as in units=128; repeatable.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder; by default a new one in models/.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on with a run that was killed.")] = False,
-) -> None:
-    """Make a policy for a case. Methods that learn show their progress."""
-    from specshield.sim import training
-
-    training.train(case, method, seed, updates, option or [], out, resume)
 
 
 def _check_address(host: str, port: int) -> None:

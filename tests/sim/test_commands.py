@@ -7,9 +7,9 @@ import signal
 import httpx
 import pytest
 
+from specshield.commands.train import _alone_in
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
-from specshield.sim.training import _alone_in
 from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
 
 

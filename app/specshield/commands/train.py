@@ -10,34 +10,34 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from specshield.errors import InputError, PolicyError
-from specshield.policy.methods import DEFAULT, METHODS, Run
-from specshield.policy.options import read_options
-from specshield.policy.tensors import replace_file
-from specshield.shipped import MODELS
-from specshield.sim.cases import load_case
-from specshield.sim.progress import StatusLine, duration
 
 
 def train(
-    case: str,
-    method: str,
-    seed: int,
-    updates: int | None,
-    options: Sequence[str],
-    out: Path | None,
-    resume: bool,
+    case: Annotated[str, typer.Option(help="A case of maps/, such as 1 or case1.")],
+    method: Annotated[
+        str, typer.Option(help="reachability, planner, dqn, or one of another package.")
+    ] = "reachability",
+    seed: Annotated[int, typer.Option(help="Seed of everything random.", min=0)] = 0,
+    updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
+    option: Annotated[list[str] | None, typer.Option(help="An option, as in units=128; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder; by default a new one in models/.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on with a run that was killed.")] = False,
 ) -> None:
-    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`, by default a folder of
-    models/ that has no policy yet.
+    """Make a policy for a case. Methods that learn show their progress."""
+    from specshield.policy.methods import DEFAULT, METHODS, Run
+    from specshield.policy.options import read_options
+    from specshield.policy.tensors import replace_file
+    from specshield.shipped import MODELS
+    from specshield.sim.cases import load_case
+    from specshield.sim.progress import StatusLine, duration
 
-    options: "name=value" for options of the method. A method may save checkpoints in `out`/checkpoint, from
-    which `resume` goes on after a kill.
-    """
     began, made_by, loaded = time.monotonic(), METHODS.get(method), load_case(case)
-    given = _parse(options) | ({} if updates is None else {"updates": updates})
+    given = _parse(option or []) | ({} if updates is None else {"updates": updates})
     try:
         chosen = read_options(made_by.options, given)
     except PolicyError as error:  # it names a field of a request
