@@ -9,8 +9,9 @@ from functools import lru_cache
 import numpy as np
 
 from specshield.arrays import Bools, Floats
+from specshield.lookahead.lattice import blocked_at
 from specshield.policy.geodesic import downhill, falling, geodesic_distance
-from specshield.robot.dynamics import displacements, step, successors
+from specshield.robot.dynamics import step
 from specshield.sim.cases import Case
 from specshield.sim.senses import RAYS, Senses, scan, see
 
@@ -65,13 +66,8 @@ class SimulatedRobot:
         return Senses(ranges, *see(self._case.body, *self.pose, *self._case.target), self.last_action)
 
     def _blocked(self) -> Bools:
-        robot, body = self._case.task.robot, self._case.body
-        after = np.empty((len(robot.motions), 3))
-        successors(body, np.array(self.pose), after)
-        moves, turns = displacements(body)
-        short = np.hypot(*(after[:, :2] - self.pose[:2]).T) < 0.5 * np.abs(moves)
-        unturned = (turns != 0.0) & (after[:, 2] == self.pose[2])
-        return np.where(robot.terminal, False, (short | unturned)[robot.motion_of])
+        robot = self._case.task.robot
+        return np.where(robot.terminal, False, blocked_at(self._case.body, *self.pose)[robot.motion_of])
 
 
 def way(case: Case, pose: Pose) -> tuple[float, float]:
