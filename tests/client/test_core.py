@@ -267,12 +267,28 @@ def test_a_server_that_starts_for_longer_than_a_call_may_take_is_said_to():
 
 
 def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts(caplog):
-    outcomes = [lost(0.01), lost(0.01), starting("1"), answer({"status": "ok"})]
+    maps = answer({"items": [], "next": None})
+    outcomes = [lost(0.01), lost(0.01), starting("1"), answer({"status": "ok"}), maps]
     result, sent, waits = drive(calls.wait_until_ready(10.0), *outcomes)
     assert result is None
-    assert {(request.method, request.path) for request in sent} == {("GET", "/readyz")}
+    assert [(request.method, request.path) for request in sent[:4]] == [("GET", "/readyz")] * 4
     assert waits == [calls.READY_EVERY] * 3
     assert [each.getMessage().split(":")[0] for each in caplog.records] == ["waiting"] * 2  # for each once
+
+
+@pytest.mark.parametrize(
+    "outcomes",
+    [
+        [replace(answer({}), content=b"<html>a page for every path</html>")],
+        [answer({"status": "ok"}), answer({"detail": "Not Found"}, 404)],
+        [answer({"status": "ok"}), answer({"status": "ok"})],
+    ],
+)
+def test_waiting_until_ready_does_not_take_another_server_for_specshield(outcomes):
+    error, _, waits = drive(calls.wait_until_ready(10.0), *outcomes)
+    assert isinstance(error, errors.ServerError | errors.NotFound)
+    assert "specshield server" in str(error)
+    assert waits == []
 
 
 def test_waiting_until_ready_ends_and_says_how_far_the_server_was():

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from specshield.client import wire
 from specshield.client.away import OnFailure, on_failure_value
 from specshield.client.core import Flow, Wait, call, deliver, erase, fetch
-from specshield.client.models import Map, Policy, SessionInfo, Spec, build
+from specshield.client.models import Map, Page, Policy, SessionInfo, Spec, build
 from specshield.client.wire import Content, Failure, Numbers, Reply, Request
 from specshield.errors import (
     InputError,
@@ -31,7 +31,8 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     """Return when the server is ready to decide: its first start takes about a minute.
 
     This also waits for a server that cannot be reached yet. A logged warning says for what. Raises
-    TransportTimeout after `timeout` [s], with the progress of the server's start.
+    TransportTimeout after `timeout` [s], with the progress of the server's start; Unauthorized if the server
+    refuses the API key; and the error of its answer if another server than specshield answers.
     """
     if timeout not in (0.0, math.inf):  # to ask once, or for ever
         wire.seconds_value(timeout, "timeout")
@@ -40,7 +41,10 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
         outcome = yield Request("GET", "/readyz")
         seconds += outcome.seconds
         if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
-            return wire.check(outcome)
+            wire.json_object(outcome)
+            maps = wire.get("maps", params={"limit": "1"})  # many servers answer /readyz, but not this
+            build(Page, (yield from call(maps)))
+            return
         error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
         if seconds >= timeout:
             raise TransportTimeout(f"not ready after {seconds:.1f} s: {error}") from error

@@ -287,7 +287,7 @@ def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
         return cls(**{name: _tuples(value) for name, value in body.items() if name in known}, **more)
     except (AttributeError, TypeError) as error:
         told = f"the server sent a {cls.__name__.lower()} that this client does not understand: {error}"
-        raise ServerError(told, got=body) from error
+        raise ServerError(told, got=body, expected="what a specshield server answers") from error
 
 
 def _tuples(value: Any) -> Any:
