@@ -156,11 +156,22 @@ def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
 
 @pytest.mark.parametrize(
     ("path", "wrong"),
-    [("seed", -1), ("seed", None), ("seed", 1.5), ("possible", lambda env: np.ones(6, bool))],
-)
-def test_a_seed_and_a_mask_that_cannot_be_used_are_refused(path: str, wrong: Any) -> None:
+    [
+        ("seed", -1), ("seed", None), ("seed", 1.5), ("margin", "wide"), ("marign", 0.1),
+        ("initial_pose", START), ("pose_of", None), ("pose_of", START), ("logits", [0.0] * 20),
+        ("possible", np.ones(20, bool)),
+    ],
+)  # fmt: skip
+def test_an_argument_that_cannot_be_used_is_refused_at_once(path: str, wrong: Any) -> None:
     with pytest.raises(InputError, match=path):
-        ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, **{path: wrong}).reset()
+        ShieldWrapper(House(), LocalShield.shipped("case1"), **{"pose_of": lambda env: START, path: wrong})
+
+
+def test_a_mask_of_another_length_is_refused() -> None:
+    shield, mask = LocalShield.shipped("case1"), np.ones(6, bool)
+    env = ShieldWrapper(House(), shield, lambda env: START, possible=lambda env: mask)
+    with pytest.raises(InputError, match="possible"):
+        env.reset()
 
 
 @pytest.mark.parametrize("wrong", ["case1", None])
@@ -184,9 +195,12 @@ def test_other_actions_than_the_robots_are_refused(space: Any) -> None:
     """Also those that are counted from another number: each would be taken for the next."""
     house = House()
     house.action_space = space
-    env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: START)
+    shield = LocalShield.shipped("case1")
     with pytest.raises(RobotError, match=r"expected Discrete\(20\)"):
-        env.reset()
+        ShieldWrapper(house, shield, lambda env: START)
+    made_later = ShieldWrapper(house, lambda env: shield, lambda env: START)
+    with pytest.raises(RobotError, match=r"expected Discrete\(20\)"):
+        made_later.reset()
 
 
 def test_a_model_may_answer_with_whatever_a_session_takes_for_logits() -> None:

@@ -28,8 +28,10 @@ from specshield.client.models import Decision, Pose
 from specshield.client.wire import Logits, logit_values
 from specshield.errors import InputError, RobotError
 from specshield.local import LocalSession, LocalShield
+from specshield.local.settings import plain, read_settings
 
 Environment = gymnasium.Env[Any, Any]
+RETURNS = {"pose_of": "(x, y, theta)", "logits": "a logit for each action", "possible": "booleans [A]"}
 Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
 
 
@@ -43,10 +45,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     dynamics do not show that. settings: of `LocalShield.session`; by default the environment moves exactly
     like the shield's robot. Each episode has its own seed, made from the seeds of `settings` and of `reset`.
 
-    Raises InputError at once for a `shield` of another type and for a seed that is no whole number. `reset`
-    raises RobotError unless the actions are numbered like the robot's, and InfeasibleStart if the rule cannot
-    be kept. `step` raises InputError for an action that does not exist. Both raise InputError if `possible`
-    does not return A booleans.
+    Raises InputError at once for an argument of another type and for a wrong setting, and RobotError unless
+    the actions are numbered like those of the shield's robot; `reset` does so for a shield that is made then.
+    `reset` also raises InfeasibleStart if the rule cannot be kept. `step` raises InputError for an action
+    that does not exist. Both raise InputError if `possible` does not return A booleans.
     """
 
     def __init__(
@@ -63,15 +65,17 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         if not (isinstance(given["shield"], LocalShield) or callable(shield)):
             expected = "a LocalShield, such as LocalShield.shipped('case1'), or a function that makes one"
             raise InputError("this is no shield", path="shield", got=shield, expected=expected)
+        for name, returns in RETURNS.items():
+            if not (callable(given[name]) or (given[name] is None and name != "pose_of")):
+                expected = f"a function that returns {returns}"
+                raise InputError("this is no function", path=name, got=given[name], expected=expected)
         gymnasium.utils.RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
-        self._settings = {"uncertainty": "none", "learn_map": False, "seed": 0, **settings}
-        try:
-            np.random.SeedSequence(index(self._settings["seed"]))
-        except (TypeError, ValueError):
-            got, expected = self._settings["seed"], "a whole number, 0 or more"
-            raise InputError("this is no seed", path="seed", got=got, expected=expected) from None
+        self._settings = plain({"uncertainty": "none", "learn_map": False, "seed": 0, **settings})
+        read_settings(self._settings)
+        if isinstance(shield, LocalShield):
+            self._check_actions(shield)
         self._since = [0, -1]  # the last seed given to `reset`, and the number of episodes since then
         self.session: LocalSession | None = None
         self.decision: Decision | None = None
@@ -81,10 +85,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         shield = self._shield if isinstance(self._shield, LocalShield) else self._shield(self.env)
-        space, n = self.env.action_space, len(shield.task.robot.actions)
-        if (getattr(space, "n", None), getattr(space, "start", None)) != (n, 0):
-            what = "the environment's actions are not the robot's"
-            raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
+        self._check_actions(shield)
         self._since = [self._since[0], self._since[1] + 1] if seed is None else [seed, 0]
         own = np.random.SeedSequence([self._settings["seed"], *self._since])
         settings = self._settings | {"seed": int(own.generate_state(1)[0])}
@@ -114,6 +115,12 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         if terminated or truncated:
             told["verdict"] = session.close()
         return observation, 0.0 if over else reward, terminated, truncated, {**info, **told}
+
+    def _check_actions(self, shield: LocalShield) -> None:
+        space, n = self.env.action_space, len(shield.task.robot.actions)
+        if (getattr(space, "n", None), getattr(space, "start", None)) != (n, 0):
+            what = "the environment's actions are not the robot's"
+            raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
 
     def _decide(
         self, session: LocalSession, observation: Any, executed: int | None, over: bool
