@@ -93,6 +93,7 @@ def test_mcap_opens_with_the_schemas_of_foxglove(recording: Recording, tmp_path:
             "/pose": "foxglove.PoseInFrame",
             "/regions": "foxglove.SceneUpdate",
             "/driven": "foxglove.SceneUpdate",
+            "/driven_lately": "foxglove.SceneUpdate",
             "/scene": "foxglove.SceneUpdate",
             "/decision": "specshield.Decision",
         }
@@ -100,7 +101,7 @@ def test_mcap_opens_with_the_schemas_of_foxglove(recording: Recording, tmp_path:
             (channel.topic, message.log_time, message.data, schema)
             for schema, channel, message in reader.iter_messages()
         ]
-        topics = ["/pose", "/regions", "/driven", "/scene", "/map"]
+        topics = ["/pose", "/regions", "/driven", "/driven_lately", "/scene", "/map"]
         decoded = [each[3] for each in reader.iter_decoded_messages(topics=topics)]
     told = [json.loads(data) for topic, _, data, _ in messages if topic == "/decision"]
     assert [each["t"] for each in told] == list(range(12))
@@ -112,50 +113,67 @@ def test_mcap_opens_with_the_schemas_of_foxglove(recording: Recording, tmp_path:
     assert recording.grid is not None
     assert np.frombuffer(grid.data, np.uint8).sum() == recording.grid.occupied.sum()
     entities = {e.id: e for each in decoded if each.DESCRIPTOR.name == "SceneUpdate" for e in each.entities}
-    assert {"region/Charger1", "region/Charger2", "driven", "recent", "continuation"} == set(entities)
+    regions, ways = {"region/Charger1", "region/Charger2"}, {"driven", "lately", "recent", "continuation"}
+    assert regions | ways == set(entities)
     circle = entities["region/Charger1"].lines[0].points
     assert [math.dist((p.x, p.y), (0.9, 5.0)) for p in circle] == pytest.approx([0.6] * len(circle))
 
 
+def room_of(path: Path) -> int:
+    if path.suffix == ".rrd":
+        return path.stat().st_size
+    from mcap.reader import make_reader
+
+    with open(path, "rb") as file:
+        return sum(len(message.data) for _, _, message in make_reader(file).iter_messages())
+
+
 @pytest.mark.parametrize(("to", "library"), [("mcap", "foxglove"), ("rrd", "rerun")])
 def test_a_session_of_thrice_as_many_steps_takes_thrice_the_room(
-    recording: Recording, to: str, library: str, tmp_path: Path
+    recording: Recording, to: str, library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each step used to hold the whole way driven. Poses at random, since the file is compressed."""
+    """Each step used to hold the whole way driven, and later each hundredth. Poses at random, since files are
+    compressed; MCAP's messages are counted before that. Shorter pieces, so that few steps have many.
+    """
     pytest.importorskip(library)
-    write = getattr(import_module(f"specshield.recordings.{library}"), f"write_{to}")
+    module = import_module(f"specshield.recordings.{library}")
+    monkeypatch.setattr(module, "PIECE", 10)
+    write = getattr(module, f"write_{to}")
     poses, sizes = np.random.default_rng(0).normal(size=(1500, 3)).tolist(), []
     items = [replace(recording.items[12], t=t, pose=tuple(pose)) for t, pose in enumerate(poses)]
     for steps in (500, 1500):
         write(replace(recording, items=items[:steps]), tmp_path / f"s.{to}")
-        sizes.append((tmp_path / f"s.{to}").stat().st_size)
+        sizes.append(room_of(tmp_path / f"s.{to}"))
     assert sizes[1] < 4.0 * sizes[0]
 
 
 def test_a_viewer_that_jumps_to_a_step_shows_all_of_the_way_driven(
-    recording: Recording, tmp_path: Path
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It shows the last message of each topic alone."""
     pytest.importorskip("foxglove")
     decoder = pytest.importorskip("mcap_protobuf.decoder")
     from mcap.reader import make_reader
 
-    from specshield.recordings.foxglove import write_mcap
+    from specshield.recordings import foxglove
 
-    poses = [(0.1 * t, -0.1 * t, 0.0) for t in range(251)]
+    monkeypatch.setattr(foxglove, "PIECE", 10)
+    poses = [(0.1 * t, -0.1 * t, 0.0) for t in range(238)]
     items = [replace(recording.items[12], t=t, pose=pose) for t, pose in enumerate(poses)]
-    write_mcap(replace(recording, items=items), tmp_path / "s.mcap")
+    foxglove.write_mcap(replace(recording, items=items), tmp_path / "s.mcap")
     with open(tmp_path / "s.mcap", "rb") as file:
         reader = make_reader(file, decoder_factories=[decoder.DecoderFactory()])
         last = {
             channel.topic: {entity.id: entity for entity in content.entities}
             for _, channel, _, content in reader.iter_decoded_messages(
-                topics=["/regions", "/driven", "/scene"]
+                topics=["/regions", "/driven", "/driven_lately", "/scene"]
             )
         }
     assert set(last["/regions"]) == {"region/Charger1", "region/Charger2"}
-    whole = [*last["/driven"]["driven"].lines[0].points, *last["/scene"]["recent"].lines[0].points[1:]]
-    assert [(p.x, p.y) for p in whole] == [pose[:2] for pose in poses]
+    lines = last["/driven"]["driven"], last["/driven_lately"]["lately"], last["/scene"]["recent"]
+    parts = [[(p.x, p.y) for p in each.lines[0].points] for each in lines]
+    assert [len(part) for part in parts] == [201, 31, 8]
+    assert parts[0] + parts[1][1:] + parts[2][1:] == [pose[:2] for pose in poses]
 
 
 def test_the_way_ahead_ends_within_the_rule(recording: Recording) -> None:

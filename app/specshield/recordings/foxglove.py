@@ -1,11 +1,13 @@
 """Writes a session as MCAP with Foxglove's schemas: map, pose and scene, and each decision as JSON.
 
 Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/decision` (specshield.Decision: the
-service's answer), and three of foxglove.SceneUpdate: `/regions`, `/driven` (the way up to the last hundredth
-step) and `/scene` (the way since then, the certified continuation). All are in the frame `map`.
+service's answer), and four of foxglove.SceneUpdate: `/regions`, `/driven` (the way up to the last
+ten-thousandth step), `/driven_lately` (from there to the last hundredth) and `/scene` (the way since then,
+the certified continuation). All are in the frame `map`.
 
 A viewer that jumps to a time shows the last message of each topic, and nothing of those before it. So each
-message shows all that its topic has to show.
+message shows all that its topic has to show. The way driven is in three topics, of which the longer ones are
+written more seldom, so that a file grows with the steps and not with their square.
 """
 
 from __future__ import annotations
@@ -48,8 +50,9 @@ def write_mcap(recording: Recording, path: Path) -> None:
     context, content = foxglove.Context(), io.BytesIO()  # foxglove raises no OSError for a file of its own
     with foxglove.open_mcap(content, context=context):
         grids, poses = GridChannel("/map", context=context), PoseInFrameChannel("/pose", context=context)
-        regions, driven, scenes = (
-            SceneUpdateChannel(topic, context=context) for topic in ("/regions", "/driven", "/scene")
+        regions, driven, lately, scenes = (
+            SceneUpdateChannel(topic, context=context)
+            for topic in ("/regions", "/driven", "/driven_lately", "/scene")
         )
         schema = foxglove.Schema(
             name="specshield.Decision", encoding="jsonschema", data=json.dumps(DECISION).encode()
@@ -63,9 +66,12 @@ def write_mcap(recording: Recording, path: Path) -> None:
                     grids.log(_grid(recording.grid, now), log_time=at)
                 regions.log(fox.SceneUpdate(entities=_regions(recording, now)), log_time=at)
             poses.log(fox.PoseInFrame(timestamp=now, frame_id=FRAME, pose=_pose(*item.pose)), log_time=at)
-            begun = item.t - item.t % PIECE
+            long_ago, begun = item.t - item.t % PIECE**2, item.t - item.t % PIECE
+            if item.t == long_ago:
+                driven.log(_lines(now, driven=(recording.driven(0, long_ago), DRIVEN)), log_time=at)
             if item.t == begun:
-                driven.log(_lines(now, driven=(recording.driven(0, begun), DRIVEN)), log_time=at)
+                line = recording.driven(long_ago, begun), DRIVEN
+                lately.log(_lines(now, lately=line), log_time=at)
             recent, ahead = recording.driven(begun, item.t), recording.ahead(item.t)[:, :2]
             drawn = _lines(now, recent=(recent, DRIVEN), continuation=(ahead, AHEAD))
             scenes.log(drawn, log_time=at)
