@@ -320,6 +320,29 @@ def test_older_steps_are_read_and_written_once_for_all_streams(server, begin, st
     asyncio.run(watch())
 
 
+def test_an_archived_session_is_read_once_for_a_stream(server, begin, step):
+    session, pose, last = begin(), ahead(1)[0], 2 * KEPT
+    for t in range(last + 1):
+        assert step(session, t, [pose]).status_code == 200
+    id, read = scoped("", session["id"]), []
+
+    async def watch():
+        async with another_server(server) as (store, _):
+            assert await put_away(store, id)
+            dump = store.dump
+
+            async def noted(id):
+                read.append(id)
+                return await dump(id)
+
+            store.dump = noted
+            alone = Watchers(store, 10, lambda: False, lambda: 0)  # which does not look for news
+            assert await ids_told(await alone.open(id, -1), last) == [*range(last + 1)]
+        assert read == [id]
+
+    asyncio.run(watch())
+
+
 def test_of_many_who_read_a_trajectory_one_is_given_a_line_in_a_round_of_the_event_loop():
     async def read():
         turns, written, most = asyncio.Lock(), 0, 0

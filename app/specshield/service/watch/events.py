@@ -25,7 +25,7 @@ from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import News, Store, shown
+from specshield.service.storage.store import Dump, News, Store, shown
 from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
 # All chosen by hand.
@@ -36,6 +36,7 @@ HERE = 3.0  # [s] since the last decision here for which a session counts as dec
 TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and in addition for
 # each session: 0.5 s for 32. A message takes some 0.1 ms.
 PARTS = 4  # in which the sessions are looked at, so that no look delays a decision for long
+ARCHIVED = 64 << 20  # [bytes] of archived sessions that are kept for the streams that are behind
 OLDER = 16  # times KEPT older steps that are kept for the streams that need the same ones: about 10 MB
 AWAY = 3.0  # [s] between two looks whether an archived session still exists
 HEARTBEAT = 15.0  # [s] without an event after which a comment is sent: less than proxies wait
@@ -57,6 +58,7 @@ class Watchers:
         # Of the streams that are behind, one at a time reads and writes older steps: that takes some ms.
         self._reading = asyncio.Lock()
         self._older = Recent[tuple[list[Told], int]](OLDER)  # by feed and first step
+        self._archived = Recent[Dump](ARCHIVED, _size)  # by feed, while it has watchers
 
     async def run(self) -> None:
         """Looks for news of the watched sessions until it is cancelled."""
@@ -183,6 +185,7 @@ class Watchers:
                 feed.watchers -= 1
                 if not feed.watchers and self._feeds.get(feed.id) is feed:
                     del self._feeds[feed.id]
+                    self._archived.drop(feed)
 
     async def _begin(self, id: str) -> Feed:
         found = there(await self._store.load(id), id)
@@ -235,6 +238,7 @@ class Watchers:
         if feed.version != known:  # a step of this process has brought it back meanwhile
             return
         if dump is None or not feed.rule(Session.of(dump)):
+            self._archived.drop(feed)
             feed.close()
         else:
             new = News(dump.state, dump.version, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
@@ -252,13 +256,22 @@ class Watchers:
             return read
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
-            dump = await self._store.dump(feed.id)
-            if dump is None or not feed.rule(Session.of(dump)):
-                return [], feed.end
-            new = News(dump.state, dump.version, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
+            dump = self._archived.peek(feed)
+            if dump is None or len(dump.steps) <= t:  # it may have been away from the archive in between
+                dump = await self._store.dump(feed.id)
+                if dump is None or not feed.rule(Session.of(dump)):
+                    return [], feed.end
+                self._archived.put(feed, dump)
+            rows = dump.rows[t * feed.width : (t + KEPT) * feed.width]
+            new = News(dump.state, dump.version, rows, dump.steps[t : t + KEPT])
         elif feed.outdated(new):
             return [], t if await self._switched(feed) else feed.end
         found, end = feed.events(t, new)
         if len(new.steps) == KEPT:
             self._older.put((feed, t), (found, end))
         return found, end if end > t else feed.end
+
+
+def _size(dump: Dump) -> int:
+    """About the bytes of a session; at most ARCHIVED, so that one of any size is kept while it is read."""
+    return min(len(dump.rows) + sum(map(len, dump.steps)), ARCHIVED)
