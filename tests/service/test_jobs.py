@@ -402,7 +402,7 @@ def test_the_owners_of_keys_take_turns_in_a_queue(tmp_path):
     store = EmbeddedStore(tmp_path)
     store.join()
     try:
-        jobs, asked = Jobs(Settings(data_dir=tmp_path)), iter("abcdefghijkl")
+        jobs, asked = Jobs(Settings(data_dir=tmp_path)), iter("abcdefghijklmn")
         worker = _Worker(store.url, jobs, ["planner"], [])
 
         def start(*owners):
@@ -421,5 +421,12 @@ def test_the_owners_of_keys_take_turns_in_a_queue(tmp_path):
         assert list(take(2)) == ["alice-a", "bob-d"]  # which are now made, by two workers
         start("carol", "bob")
         assert list(take(7)) == ["-f", "carol-h", "alice-b", "bob-e", "alice-c", "bob-i", "alice-g"]
+
+        start("dave", "dave", "dave", "dave", "erin")
+        for owner in ("dave", "frank", "erin", "dave"):  # the second asks for it as his first one
+            jobs.ask_too("dave-m", "planner", owner)
+        assert list(take(5)) == ["dave-j", "erin-n", "dave-m", "dave-k", "dave-l"]
+        jobs.ask_too("dave-m", "planner", "gina")  # it is being made
+        assert jobs.counts()[0]["planner", "queued"] == 0
     finally:
         store.leave()

@@ -91,7 +91,8 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
 
 def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict[str, Any]:
     made, name = server.policies.made_here(asked.id), asked.about.method
-    queued = made is None or _training(server, made).status == "failed"
+    status = "failed" if made is None else _training(server, made).status
+    queued = status == "failed"
     own = [] if server.worker is None else server.worker.methods
     if queued and name not in own and not server.jobs.worker_there(name):
         needs = METHODS.get(name).needs
@@ -102,6 +103,8 @@ def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict
     record = server.policies.add(asked, caller)
     if queued:
         server.jobs.start(record.id, name, caller.name)
+    elif status == "queued":
+        server.jobs.ask_too(record.id, name, caller.name)
     if called is not None:
         server.policies.name(record, caller.name, called)
     return _show(server, record, caller.name)

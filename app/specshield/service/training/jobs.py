@@ -4,7 +4,8 @@ A run writes its state only while its `attempt`, the name of its job, is the lat
 and asking again are one write each. A run counts as failed if it gives no more signs of life, or if it has
 left the queue and never gave one.
 
-In a queue the owners of API keys take turns: an attempt begins with a mark of its owner.
+In a queue the owners of API keys take turns: an attempt begins with a mark of its owner. A run that several
+owners ask for belongs to the one whose turn for it comes first.
 """
 
 from __future__ import annotations
@@ -71,14 +72,29 @@ class Jobs:
 
     def start(self, id: str, method: str, owner: str) -> None:
         """Queues a run for this policy, which an owner has asked for."""
-        attempt = hashlib.sha256(owner.encode()).hexdigest()[:OWNER] + secrets.token_hex(8)
+        attempt = _mark(owner) + secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
         self.sign_of_life(id, attempt)  # for the moment in which the state is written and the queue is not
         with reaching():
             self.redis.hset(_key(id), mapping={**state, "method": method})
             self._enqueue(id, attempt, method)
-            self._take_turn(attempt, method)
+            self._move(attempt, self._turn(_mark(owner), method, attempt), method)
         logs.tell("policy queued", policy_id=id, method=method)
+
+    def ask_too(self, id: str, method: str, owner: str) -> None:
+        """Makes a waiting run that of another owner who asks for the policy, if its turn comes sooner so."""
+        attempt = (reached(lambda: self.redis.hget(_key(id), "attempt")) or b"").decode()
+        queue, own = self._queue(method), _mark(owner)
+        with reaching():
+            before = self._turn(own, method, attempt)
+            if before is None or own == attempt[:OWNER]:
+                return
+            self.sign_of_life(id, attempt)  # for the moment in which the queue does not have it
+            if self.redis.lrem(queue.key, 1, attempt):  # else a worker has taken it
+                again = own + secrets.token_hex(8)
+                if self.report(id, attempt, attempt=again):  # else it was cancelled
+                    self._enqueue(id, again, method)
+                    self._move(again, before, method)
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
         settings = self._settings
@@ -93,20 +109,28 @@ class Jobs:
             at_front=at_front,
         )
 
-    def _take_turn(self, attempt: str, method: str) -> None:
-        """Moves a run from the end of the queue to before the first one whose owner has more runs before it,
-        running or waiting, than this one's owner has.
+    def _turn(self, own: str, method: str, attempt: str) -> str | None:
+        """The waiting run before which this attempt would stand if it were that of the owner with the mark
+        `own`: the first one whose owner has more runs before it, running or waiting, than this owner has.
+        None if no such run stands before it now.
         """
-        queue, own = self._queue(method), attempt[:OWNER]
+        queue = self._queue(method)
         running = self.redis.zrange(queue.started_job_registry.key, 0, -1)
         waiting = [each.decode() for each in self.redis.lrange(queue.key, 0, -1)]
         before = Counter(each.decode()[:OWNER] for each in running)
         most = before[own] + sum(each[:OWNER] == own for each in waiting if each != attempt)
         for other in waiting:
+            if other == attempt:
+                return None
             if before[other[:OWNER]] > most:
-                self.redis.eval(MOVE, 1, queue.key, attempt, other)
-                return
+                return other
             before[other[:OWNER]] += 1
+        return None
+
+    def _move(self, attempt: str, before: str | None, method: str) -> None:
+        """Moves a run from the end of the queue to before another one."""
+        if before is not None:
+            self.redis.eval(MOVE, 1, self._queue(method).key, attempt, before)
 
     def _queue(self, method: str) -> Queue:
         return Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
@@ -193,6 +217,10 @@ class Jobs:
 def learns(method: str) -> bool:
     """Whether the method learns, which may take hours: these are the methods that need additional modules."""
     return bool(METHODS.get(method).needs)
+
+
+def _mark(owner: str) -> str:
+    return hashlib.sha256(owner.encode()).hexdigest()[:OWNER]
 
 
 def queue_of(method: str) -> str:
