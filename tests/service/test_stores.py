@@ -434,3 +434,19 @@ def test_a_cluster_that_is_away_is_said_to_be(tmp_path):
             response = client.get(path)
             assert (response.status_code, response.json()["type"]) == (503, "store-unavailable"), path
         assert "Traceback" not in server.log.read_text()
+
+
+def test_one_master_of_a_cluster_that_is_away_is_not_taken_for_the_store(tmp_path):
+    """The robots whose sessions the other masters have go on, and /readyz keeps their server in use."""
+
+    def up(client: httpx.Client) -> list[float]:
+        lines = client.get("/metrics").text.splitlines()
+        return [float(line.split()[1]) for line in lines if line.startswith("specshield_store_up ")]
+
+    with cluster(tmp_path / "store") as nodes, on_store(tmp_path, nodes.url) as server:
+        client = httpx.Client(base_url=server.url, timeout=HUNG)
+        wait_for(lambda: up(client) == [1.0])  # on a busy machine it may be late once
+        for node, left in zip(nodes.nodes[:3], (2 / 3, 1 / 3, 0.0), strict=True):
+            node.shutdown(nosave=True)
+            wait_for(partial(lambda left: up(client) == [pytest.approx(left)], left))
+            assert client.get("/readyz").status_code == (200 if left else 503)

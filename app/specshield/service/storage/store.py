@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import anyio
 import redis
 
-from specshield.errors import LimitReached, SessionExists
+from specshield.errors import LimitReached, SessionExists, StoreError
 from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
@@ -39,6 +39,7 @@ FOLLOW = Script("""\
 redis.call('PERSIST', KEYS[1])
 redis.call('SET', KEYS[1], '', 'EX', 60)
 return ''""")
+PING = Script("return redis.call('SET', KEYS[1], 1, 'EX', 60)")
 # A script, since a store whose memory is full refuses all commands of a transaction, also those that read.
 DUMP = """\
 return {redis.call('HMGET', KEYS[1], 'config', 'state', 'version'), redis.call('GET', KEYS[2]),
@@ -116,10 +117,39 @@ class Store:
             yield
 
     async def ping(self) -> None:
-        """Checks that the store takes a write: a store whose disk is full still answers reads."""
+        """Checks that the store takes a write: a store whose disk is full still answers reads. In a cluster
+        one master is enough, since sessions whose keys it has go on without the others.
+        """
+        writes, told = await self._test_writes(), None
+        try:
+            for write in asyncio.as_completed(writes):
+                if (told := await write) is None:
+                    return
+        finally:
+            for each in writes:
+                each.cancel()
+        assert told is not None
+        raise told
+
+    async def up(self) -> float:
+        """The share of the store's masters that take a write: 1 or 0 for a single server."""
+        told = await asyncio.gather(*await self._test_writes())
+        return told.count(None) / len(told)
+
+    async def _test_writes(self) -> list[asyncio.Task[StoreError | None]]:
+        """For each master a write, which returns the error where the master does not take it."""
+
+        async def write(key: str) -> StoreError | None:
+            try:
+                with reaching():
+                    await self._wire.run(PING, [key], ())
+            except StoreError as error:
+                return error
+            return None
+
         async with self._reaching():
-            await self.redis.set("specshield:ready", 1, ex=60)
-        await self.follow()
+            keys = await self._wire.of_each("specshield:ready")
+        return [asyncio.create_task(write(key)) for key in keys]
 
     async def follow(self) -> None:
         """Returns once as many replicas as were asked for have all that was written before."""

@@ -116,7 +116,7 @@ class Jobs:
         """
         queue = self._queue(method)
         running = self.redis.zrange(queue.started_job_registry.key, 0, -1)
-        waiting = [each.decode() for each in self.redis.lrange(queue.key, 0, -1)]
+        waiting: list[str] = [each.decode() for each in self.redis.lrange(queue.key, 0, -1)]
         before = Counter(each.decode()[:OWNER] for each in running)
         most = before[own] + sum(each[:OWNER] == own for each in waiting if each != attempt)
         for other in waiting:

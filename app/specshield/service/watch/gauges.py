@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import AsyncIterator, Awaitable
+from typing import TypeVar
 
 import anyio
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -14,12 +16,13 @@ from specshield.service.storage.store import Store
 from specshield.service.training.jobs import Jobs
 
 Kind = type[GaugeMetricFamily] | type[CounterMetricFamily]
+T = TypeVar("T")
 KEPT_FOR = 2.0  # [s] for which the values of a scrape answer further ones; chosen by hand
 log = logging.getLogger("specshield")
 
 
 class Gauges:
-    """Numbers of sessions and jobs, and the store's memory; only `specshield_store_up 0` while it is away."""
+    """Numbers of sessions and jobs, and the store's memory, as far as the store tells them."""
 
     def __init__(self, store: Store, jobs: Jobs) -> None:
         self._store, self._jobs = store, jobs
@@ -30,29 +33,32 @@ class Gauges:
         """The families, at most KEPT_FOR old."""
         async with self._asking:  # of several scrapes at once, only one asks the store
             if time.monotonic() - self._asked > KEPT_FOR:
-                try:
-                    self._found = await self._families()
-                except StoreError as error:
-                    log.warning("/metrics tells nothing of the store now: %s%s", error, cause_of(error))
-                    self._found = [_up(0)]
+                self._found = [metric async for metric in self._families()]
                 self._asked = time.monotonic()
         return self._found
 
-    async def _families(self) -> list[Metric]:
-        sessions, held = await self._store.count(None), await self._store.held_bytes()
-        waiting, ended = await anyio.to_thread.run_sync(self._jobs.counts)
-        memory = GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held)
-        return [
-            _up(1),
-            GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions),
-            *([] if held is None else [memory]),
-            _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting),
-            _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended),
-        ]
+    async def _families(self) -> AsyncIterator[Metric]:
+        up = await _told(self._store.up()) or 0.0
+        yield GaugeMetricFamily("specshield_store_up", "Share of the store's masters that take a write.", up)
+        if up == 0.0:
+            return
+        if (sessions := await _told(self._store.count(None))) is not None:
+            yield GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions)
+        if (held := await _told(self._store.held_bytes())) is not None:
+            yield GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held)
+        if (jobs := await _told(anyio.to_thread.run_sync(self._jobs.counts))) is not None:
+            waiting, ended = jobs
+            yield _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting)
+            yield _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended)
 
 
-def _up(value: int) -> Metric:
-    return GaugeMetricFamily("specshield_store_up", "Whether the store answers.", value)
+async def _told(asked: Awaitable[T]) -> T | None:
+    """What the store tells; None, with a line of the log, while it does not."""
+    try:
+        return await asked
+    except StoreError as error:
+        log.warning("/metrics does not tell all of the store now: %s%s", error, cause_of(error))
+        return None
 
 
 def _by(kind: Kind, name: str, help: str, counts: dict[tuple[str, str], int]) -> Metric:
