@@ -150,6 +150,24 @@ def half_bodies(url: str) -> None:
     _at_once(16, send)
 
 
+def long_histories(url: str) -> None:
+    """Steps that carry 10,000 poses: the first of a session, and some that send all of them again."""
+    body = {"policy_id": "case1", "initial_pose": START, "max_steps": 10_000, "allow_infeasible": True}
+    told, end = json.dumps([START] * 9_991)[1:-1], time.monotonic() + LASTS
+
+    def send(client: httpx.Client) -> None:
+        while time.monotonic() < end:
+            session = client.post("/v1/sessions", json=body).raise_for_status().json()
+            path, logits = f"/v1/sessions/{session['id']}/steps", json.dumps([0.0] * 20)
+            for t in range(9_990, 10_000):
+                poses = told + f",{json.dumps(START)}" * (t - 9_990)
+                step = f'{{"t":{t},"poses":[{poses}],"logits":{logits}}}'
+                client.post(path, content=step, headers=JSON)
+            client.delete(f"/v1/sessions/{session['id']}")
+
+    _at_once(8, lambda: _with_client(url, send))
+
+
 def changing_maps(url: str) -> None:
     """Four robots that see a new obstacle at every step, ten steps a second, so that each decides
     on a map of its own and tables are made anew all the time.
@@ -172,7 +190,7 @@ ATTACKS: dict[str, Callable[[str], None]] = {
     made.__name__: made
     for made in (
         big_map, wrong_map, listing, expensive_house, planners, endless_lookahead, unknown_fields,
-        connections, headers, half_bodies,
+        connections, headers, half_bodies, long_histories,
     )
 }  # fmt: skip
 # Robots, not attacks. What they take of the memory is kept: 256 MiB of tables (service/heavy/tables.py).

@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from collections import defaultdict
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -152,3 +153,37 @@ def test_policies_that_this_process_has_not_read_are_read_in_a_thread(tmp_path):
 
     assert asyncio.run(decide()).decision.t == 0
     assert threading.main_thread() not in read_in
+
+
+def test_steps_with_long_histories_come_one_at_a_time_and_after_a_step_that_is_being_decided(tmp_path):
+    """Each takes some ms of the event loop: of eight at once, another robot waited for all."""
+    settings, told = Settings(data_dir=tmp_path), []
+
+    class Noting(Shields):
+        def of(self, session):
+            told.append(session.id)
+            return super().of(session)
+
+    shields, start = Noting(policies_of(settings)), [4.5, 5.0, 0.0]
+    case1 = shields.policies.find("case1", "").id
+
+    async def decide():
+        store = Store("redis://127.0.0.1:1", 1.0, 60)  # is not asked here
+        steps = Steps(store, shields, Threads(), Heavy(settings), 60, lambda *_: None)
+
+        async def long(id):
+            state = State(1, 0, True, "pending", 0.0, b"")
+            begun = [rule(policy_ids=[case1], id=id)], Config(max_steps=9000), state, b"", np.array([start])
+            request = StepBody(8000, [start] * 8001, [0.0] * 20)
+            await steps._decide(Session(*begun, [], 0, 0), request, defaultdict(float))
+
+        steps.deciding = 3  # another step, and these
+        both = asyncio.gather(long("a"), long("b"))
+        for _ in range(3):
+            await asyncio.sleep(0)
+        told.append("the other step is decided")
+        steps.deciding -= 1
+        await both
+
+    asyncio.run(decide())
+    assert [name for name, _ in groupby(told)] == ["the other step is decided", "a", "b"]

@@ -142,6 +142,10 @@ class Bodies:
             if upload:
                 scope["state"]["body"] = body
                 await self.app(scope, receive, send)
+            elif body.size > FREE and path.endswith(("/close", "/switch")):  # steps.py does so for steps
+                steps = scope["app"].state.server.sessions.steps
+                replay = _replay(body.content, receive)
+                await steps.giving_way(scope["state"]["owner"], self.app, scope, replay, send)
             else:
                 await self.app(scope, _replay(body.content, receive), send)
         finally:

@@ -27,6 +27,8 @@ from specshield.service import metrics, problems
 from specshield.service.routes.messages import MSGPACK, accepts, read_step, write_problem
 from specshield.service.schemas.answers import to_json, to_msgpack
 from specshield.service.schemas.base import ID
+from specshield.service.schemas.steps import StepBody
+from specshield.service.sessions.steps import LONG_BODY
 from specshield.service.state import Server
 from specshield.service.storage.store import scoped
 from specshield.service.watch import logs
@@ -68,14 +70,23 @@ async def _answer_step(scope: Scope, receive: Receive, send: Send) -> None:
     headers = dict(scope["headers"])
     body = (await receive())["body"]  # the whole body: bounds/bodies.py has waited for it
     packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
-    request = read_step(body, packed)
     server: Server = scope["app"].state.server
+    request = await _read(server, scope, body, packed)
     answer = await server.sessions.steps.decide(_key(scope), request, scope["state"]["timing"])
     packed = accepts(headers.get(b"accept", b"").decode("latin-1"), MSGPACK)
     content = to_msgpack(answer) if packed else to_json(answer)
     told = [(b"content-length", b"%d" % len(content)), (b"content-type", PACKED if packed else JSON)]
     await send({"type": "http.response.start", "status": 200, "headers": told})
     await send({"type": "http.response.body", "body": content})
+
+
+async def _read(server: Server, scope: Scope, body: bytes | str, packed: bool) -> StepBody:
+    async def read() -> StepBody:
+        return read_step(body, packed)
+
+    if len(body) <= LONG_BODY:
+        return read_step(body, packed)
+    return await server.sessions.steps.giving_way(scope["state"]["owner"], read)
 
 
 def _key(scope: Scope) -> str:
@@ -147,7 +158,7 @@ class _Stream:
         try:
             api_key = await self._server.keys.check(self._authorization)  # the key may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
-            request = read_step(content, packed)
+            request = await _read(self._server, self._scope, content, packed)
             answer = await self._server.sessions.steps.decide(self._key, request, defaultdict(float))
             return 200, to_msgpack(answer) if packed else to_json(answer)
         except Exception as error:

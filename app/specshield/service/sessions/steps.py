@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -19,6 +19,7 @@ from specshield.episode.handover import check_signals
 from specshield.errors import SpecshieldError
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.heavy.pool import Turns
 from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.schemas.steps import StepBody
@@ -31,10 +32,15 @@ from specshield.service.sessions.state import State
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
 
+T = TypeVar("T")
 ROOM = 64 << 20  # [bytes] of sessions kept in memory: some 4,000. Chosen by hand.
 WATCHED = 32  # decisions that are made in threads after a long one. Chosen by hand.
 SHORT = 0.005  # [s] that one decision may hold the event loop
 LONG = 0.03  # [s] of a processor; decisions that take longer are made in another process
+LONG_BODY = 64 << 10  # [bytes] of a step that is read in turn
+MANY = 1000  # poses in a step that is decided in turn. With 10,000 each takes some ms of the event loop.
+WAITING = 256  # such steps of one owner that wait
+MOMENT, GIVE_WAY = 0.003, 8  # [s] about a decision, and the most of such waits; all five chosen by hand
 SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
 # The session's key, its version before and after, its state, x_t with the signals, the record and the answer.
 Tell = Callable[[str, bytes, bytes, State, Floats, StepRecord, StepAnswer], None]
@@ -95,6 +101,7 @@ class Steps:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
         self._heavy, self._tell = heavy, tell
         self.deciding = 0  # steps that are being decided
+        self._turns = Turns(1, WAITING)
         # A kept session may be out of date, since other processes write too: the append then finds that out.
         self.recent = files.Recent[Session](ROOM, attrgetter("size"))
         self._paces = files.Recent[Pace](1000)
@@ -178,6 +185,32 @@ class Steps:
             made, seconds, _ = await self._heavy.decide(*asked, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
+        if len(request.poses) <= MANY:
+            return await self._decide_here(session, request, pace, timing)
+        self.deciding -= 1
+        try:
+            given = session, request, pace, timing
+            return await self.giving_way(session.rule.owner, self._decide_here, *given)
+        finally:
+            self.deciding += 1
+
+    async def giving_way(self, owner: str, call: Callable[..., Awaitable[T]], /, *args: Any) -> T:
+        """The result of a call that takes some ms of the event loop, as for a step with a long history. Such
+        calls are made one at a time, and wait a little while other steps are being decided.
+        """
+        await self._turns.take(owner)
+        try:
+            for _ in range(GIVE_WAY):
+                if not self.deciding:
+                    break
+                await asyncio.sleep(MOMENT)
+            return await call(*args)
+        finally:
+            self._turns.give()
+
+    async def _decide_here(
+        self, session: Session, request: StepBody, pace: Pace, timing: defaultdict[str, float]
+    ) -> Decided:
         cpu: float | None = None
         # A step may take long once the map is no longer the one that the policies were made for. The first
         # ones may have to read the policies, so `learns`, which needs them too, is not asked before these.
@@ -191,8 +224,8 @@ class Steps:
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
         timing["rollout"] += seconds
-        # The time on a changed map says nothing about other sessions with these policies.
-        if not (request.occupied or request.free or made.decision.map_revision):
+        # The time on a changed map, or with a long history, says nothing of others with these policies.
+        if not (request.occupied or request.free or made.decision.map_revision or len(request.poses) > MANY):
             pace.add(seconds, cpu)
         return made
 
