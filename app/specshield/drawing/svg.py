@@ -36,7 +36,8 @@ text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospac
 @media (prefers-color-scheme:dark){.paper{fill:#16181d}.ink{fill:#e8e9ec}.faint{fill:#9a9da6}
 .walls{filter:brightness(1.75)}.visit{fill:#57c48f;stroke:#57c48f}.avoid{fill:#f07a72;stroke:#f07a72}
 .way,.next{stroke:#78a8ff}.robot,.mark{fill:#78a8ff;stroke:#78a8ff}}
-.name{stroke:none;font-weight:600}
+text,.name{stroke:#faf9f6;stroke-width:.2em;paint-order:stroke}.name{font-weight:600}
+@media (prefers-color-scheme:dark){text,.name{stroke:#16181d}}
 """
 
 # For text below the map: height and width of a letter, height of a line [1/1000 of the map's longer side].

@@ -44,7 +44,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
 def _rooms(plan: Plan, case: Case) -> None:
     """Writes the names of rooms that are no regions of the rule, away from regions and the target."""
     grid = case.task.grid
-    taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
+    taken = [signed_distance(region, grid.centres) > -0.8 for region in case.task.regions.values()]
     taken.append(np.hypot(*np.moveaxis(grid.centres - case.target, -1, 0)) < 0.8)
     for name, room in case.rooms.items():
         roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)

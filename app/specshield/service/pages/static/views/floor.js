@@ -11,6 +11,7 @@ import { Replay } from "./replay.js";
 import { State } from "./state.js";
 
 const JUDGED = 8; // rules of which is asked what they avoid
+const HEADS = ["Step", "Mode", "Feasible", "Rule"]; // of the columns beside the robots
 const AT_ONCE = 3; // trajectories that are read at once: a browser has six connections to a server
 
 export async function show(place, { query, signal }) {
@@ -43,7 +44,7 @@ export async function show(place, { query, signal }) {
     if (item && floor.occupancy) learned.heard(item, signal);
   };
   const replay = new Replay(draw);
-  const heads = ["Robot", "Step", "Mode", "Feasible", "Rule"].map((name) => el("th", { scope: "col" }, name));
+  const heads = ["Robot", ...HEADS].map((name) => el("th", { scope: "col" }, name));
   const list = el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, all.map((each) => each.row)));
   draw();
   place.append(
@@ -138,7 +139,7 @@ function row(session, i) {
     "tr",
     {},
     el("th", { scope: "row" }, el("i", { class: `dot color-${i % 8}` }), name),
-    ...["", "", "", ""].map(() => el("td", { class: "number" })),
+    ...HEADS.map((name) => el("td", { class: "number", "data-head": name })),
   );
 }
 

@@ -182,7 +182,7 @@ function bar(kind, share) {
 /** What an action does, in words. */
 export function does({ translate, rotate, terminal }) {
   if (terminal) return "ends the task";
-  const turn = rotate && `turns ${((180 * rotate) / Math.PI).toFixed(0)}°`;
-  const go = translate && `moves ${translate.toFixed(2)} m`;
+  const turn = rotate && `turns ${rotate < 0 ? "right" : "left"} ${((180 * Math.abs(rotate)) / Math.PI).toFixed(0)}°`;
+  const go = translate && `moves ${translate < 0 ? "back " : ""}${Math.abs(translate).toFixed(2)} m`;
   return [go, turn].filter(Boolean).join(", ") || "leaves the base where it is";
 }

@@ -28,8 +28,8 @@ function row(policy) {
     {},
     el("th", { scope: "row" }, el("a", { href: `#/policies/${policy.id}`, title: policy.id })),
     el("td", {}, el("code", {}, policy.spec.formula)),
-    el("td", {}, policy.method),
-    el("td", {}, el("span")),
+    el("td", { "data-head": "Method" }, policy.method),
+    el("td", { "data-head": "State" }, el("span")),
   );
 }
 

@@ -63,13 +63,13 @@ function fillFloor(section, [, sessions]) {
   const ids = sessions.slice(0, MOST).map((session) => session.id);
   const together = section.querySelector(".together");
   together.href = `#/floor?sessions=${ids.join(",")}`;
-  write(together, `Show ${ids.length} on one floor`);
+  write(together, ids.length === 1 ? "Show it on one floor" : `Show ${ids.length} on one floor`);
   keep(section.querySelector("tbody"), sessions, { key: (session) => session.id, make: row, fill: fillRow });
 }
 
 function table() {
   const heads = ["Robot", "Rule", "Step", "The rule is", "The robot is"].map((name) => el("th", { scope: "col" }, name));
-  return el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody"));
+  return el("table", { class: "list robots" }, el("thead", {}, el("tr", {}, heads)), el("tbody"));
 }
 
 function row({ id }) {
@@ -78,9 +78,9 @@ function row({ id }) {
     {},
     el("th", { scope: "row" }, el("a", { href: `#/sessions/${id}`, title: id }, short(id))),
     el("td", {}, el("code")),
-    el("td", { class: "number" }),
-    el("td", {}, el("span")),
-    el("td"),
+    el("td", { class: "number", "data-head": "Step" }),
+    el("td", { "data-head": "The rule is" }, el("span")),
+    el("td", { "data-head": "The robot is" }),
   );
 }
 
