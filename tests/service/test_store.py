@@ -221,15 +221,18 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
     own = EmbeddedStore(tmp_path / "own")
     own.join()
     try:
-        bounds = {"SPECSHIELD_MAX_SESSIONS": "1", "SPECSHIELD_MAX_STEPS": "200"}
+        bounds = {"SPECSHIELD_MAX_SESSIONS": "1", "SPECSHIELD_MAX_STEPS": "145"}
         with serving(tmp_path / "data", REDIS_URL=own.url, SPECSHIELD_SESSION_TTL="3600", **bounds) as server:
             assert not (tmp_path / "data" / "store").exists()
             with (
                 httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
                 redis.Redis(unix_socket_path=str(own.socket)) as connection,
             ):
+                long = client.post("/v1/sessions", json={"policy_id": "case2", "initial_pose": START})
+                assert (long.status_code, long.json()["path"]) == (422, "policy_id"), long.text
+                assert (long.json()["got"], long.json()["expected"]) == ("step 150", "at most step 145")
                 session = begin(client)
-                assert session["max_steps"] == 200
+                assert session["max_steps"] == 145
                 keys = connection.keys(f"specshield:*{session['id']}*")
                 assert 3000 < min(map(connection.ttl, keys)) <= max(map(connection.ttl, keys)) <= 3600
                 full = client.post("/v1/sessions", json={"policy_id": "case1", "initial_pose": START})

@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import connect
 
 from specshield.client import ShieldClient
-from specshield.errors import InputError
+from specshield.errors import BodyTooLarge, InputError
 from specshield.local import LocalShield
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
@@ -221,6 +221,8 @@ def test_messages_that_never_end_take_no_more_than_all_bodies_may(tmp_path):
         ShieldClient(server.url, timeout=HUNG) as client,
         ExitStack() as opened,
     ):
+        with pytest.raises(BodyTooLarge, match="at most 2097152 bytes"):  # nor may an upload ever have more
+            client.maps.upload("resolution: 0.05", b" " * (3 << 20))
         session = client.sessions.create(policy_id="case1", initial_pose=(5.0, 5.0, 0.0))
         address = stream_of(server, {"id": session.id})
         streams = [opened.enter_context(connect(address, ping_interval=None)) for _ in range(4)]

@@ -160,8 +160,8 @@ class Bodies:
         await self.app(scope, _replay(message.get("body", b""), receive), send)
 
     def _limit(self, path: str) -> int:
-        if path in UPLOADS:
-            return self._settings.max_upload_bytes
+        if path in UPLOADS:  # a larger one than all together may have would have to wait for ever
+            return min(self._settings.max_upload_bytes, self._settings.max_bodies_bytes)
         most = self._settings.max_body_bytes
         return most if path.endswith(LONG) else min(most, FREE)
 

@@ -93,7 +93,14 @@ class Sessions:
         if request.shaping != PROJECTION:
             about = request.shaping, request.policies, request.initial_pose, key.name
             preference = await self._shields.prepared(self._run, *about)
-        ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
+        found = await self._run(lambda: [self._policies.find(id, key.name) for id in request.policies])
+        if (last := found[0].horizon) > (most := self._settings.max_steps):
+            told, expected = (
+                "the rule ends after the last step that a session can have",
+                f"at most step {most}",
+            )
+            raise InputError(told, path="policy_id", got=f"step {last}", expected=expected)
+        ids = [record.id for record in found]
         asked = request, settings, preference, key.name
         try:  # in another process where the policies' decisions take long, else in a thread
             if preference is None and await self._run(self._shields.slow_policies, ids):
