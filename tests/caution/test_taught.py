@@ -29,7 +29,7 @@ from specshield.robot import STRETCH, Action, Robot
 from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import make_task
-from specshield.world.learned import CONTACT, SENT, LearnedMap, applied, learn
+from specshield.world.learned import CONTACT, SENT, LearnedMap, applied, learn, revised
 from specshield.world.occupancy import OccupancyGrid
 from tests.made import synthesise
 
@@ -94,6 +94,36 @@ def test_a_robot_without_sensors_learns_from_what_it_runs_into():
     _, last = drive(shield_of(60, learn_map=True))
     assert last.spec_status == "satisfied"
     assert last.map_revision >= 1
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0])
+def test_what_stopped_a_move_that_did_not_begin_is_taken_to_be_half_way(heading):
+    """A robot that stays where it is does so wherever on its way the thing stands."""
+    robot = Robot("stays", 0.2, (0.0, 0.0), "stay", (Action("on", 0.4), Action("left", rotate=0.5)))
+    task = make_task(room().task.grid, robot, "F[0,40] x > 3.5 or F[0,40] y > 1.7")
+    shield, pose, carry = make_shield([plan(task, Plan())], Config(learn_map=True)), (1.0, 0.5, heading), None
+    for t in range(3):  # twice nothing happens
+        carry = decide(shield, [pose] * (t + 1), [9.0, -9.0], carry=carry).carry
+    known = Taught.from_bytes(carry.learned).map
+    y, x = np.divmod(known.cell[known.occupied & (known.by == CONTACT)], task.grid.width) * np.array(0.05)
+    ahead = (x + 0.025 - 1.0) * math.cos(heading) + (y + 0.025 - 0.5) * math.sin(heading)
+    assert ahead.min() > 0.35  # the front is at 0.2 m, and half way at 0.4 m
+    assert ahead.max() < 0.5
+
+
+@pytest.mark.parametrize(("gap", "counts"), [(0.15, True), (0.5, False)])
+def test_who_stands_still_beside_what_was_touched_has_met_it_again(gap, counts):
+    """Far from all that was touched the first time may be a slip. Beside it no second step is spent."""
+    shield, left = shield_of(40, learn_map=True, uncertainty=Uncertainty()), STRETCH.action_names.index("l")
+    logits = np.where(np.arange(len(STRETCH.actions)) == left, 30.0, -30.0)
+    carry = decide(shield, [START], logits).carry
+    before, row = Taught.from_bytes(carry.learned), 20 + int((STRETCH.radius + gap) / 0.05)
+    cells = row * shield.task.grid.width + np.array([9, 10])
+    touched = revised(before.map, learn(shield.task.grid, before.map, 0, cells, True, CONTACT))
+    carry = carry._replace(learned=before._replace(map=touched).to_bytes())
+    after = decide(shield, [START, START], logits, carry=carry)
+    bars = [motion for *_, motion in after.carry.stuck]
+    assert (int(STRETCH.motion_of[left]) in bars) == counts
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

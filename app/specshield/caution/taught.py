@@ -31,6 +31,7 @@ from specshield.caution.surprise.contact import (
     cells_under,
     contact_of,
     is_near,
+    lies_beside,
     moved_on,
 )
 from specshield.caution.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
@@ -132,8 +133,11 @@ def teach(
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)
-        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
-        if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
+        felt = known.cell[known.occupied & (known.by != SENT)]
+        beside = is_near(poses[-2:-1], poses[-1], near) and lies_beside(body, felt, poses[-1], drawn)
+        again = beside or halts > 0
+        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, again)
+        if motion >= 0 and followed.met < 2 and not (beside or was_stopped(shield, carry, poses, halts)):
             motion, followed = -1, followed._replace(halted=motion, met=0)
         if motion < 0 and not (drawn >= 0 and is_near(carry.next_poses[drawn : drawn + 1], poses[-1], near)):
             on = went_on(body, poses[-2], carry.next_poses, poses[-1], near)

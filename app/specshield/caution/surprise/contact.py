@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
-from specshield.caution.experience import SELDOM
+from specshield.caution.experience import BESIDE, SELDOM
 from specshield.compiled import kernel
 from specshield.portable import arctan2
 from specshield.robot.body import centre
@@ -129,8 +129,12 @@ def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tup
 
     CONTACT, LEFT and RIGHT lie within a cell's side of the footprint: straight ahead of where its centre
     goes, which a turn swings, and to both sides of that. BEHIND is the rest of an obstacle of the usual size.
-    Cells that the footprint overlapped at the poses driven [n, 3] are left out.
+    Cells that the footprint overlapped at the poses driven [n, 3] are left out. A move of a robot that stays
+    where it is may have met something anywhere along its way, so that is taken to be half way.
     """
+    if not body.stop:
+        half = 0.5 * displacement(body, motion)[0]
+        pose = pose + np.array([half * math.cos(pose[2]), half * math.sin(pose[2]), 0.0])
     cells, gap, bearing = _around(body, pose, THING)
     aside = np.remainder(bearing - _direction(body, pose, motion) + math.pi, 2.0 * math.pi) - math.pi
     far = gap + body.radius
@@ -145,6 +149,15 @@ def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tup
     )
     clear = _gaps(body, cells, driven) < -UNDER
     return [(by, cells[part & ~clear]) for by, part in parts]
+
+
+def lies_beside(body: Body, cells: Ints, pose: Floats, motion: int) -> bool:
+    """Whether one of the cells [n] is beside the footprint at a pose (3,), or where a motion leads it."""
+    if motion < 0 or not len(cells):
+        return False
+    far, (x, y, theta) = displacement(body, motion)[0], pose
+    ends = np.array([pose, (x + far * math.cos(theta), y + far * math.sin(theta), theta)])
+    return bool(_gaps(body, cells, ends).min() <= BESIDE)
 
 
 def _direction(body: Body, pose: Floats, motion: int) -> float:
