@@ -429,6 +429,33 @@ def test_a_robot_whose_scanner_sees_its_own_body_all_round_is_not_shut_in(skin):
     assert decision.spec_status == "satisfied"
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_what_is_met_again_is_first_taken_for_what_was_touched_before_and_is_a_little_larger(side):
+    """A thing from the wall to the middle of a room of 2 m, which is in truth 10 cm longer than was marked. A
+    robot of 70 cm touches its end. With marks all along the robot's front too, no way is left beside it.
+    """
+    grid, robot = room().task.grid, replace(STRETCH, name="broad", radius=0.35, offset=(0.0, 0.0))
+    policy = synthesise(make_task(grid, robot, "F[0,20] x > 2.8"), Settings(pitch=0.05))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=Uncertainty()))
+    marked, real = np.zeros((2, *grid.occupied.shape), bool)
+    marked[:18, 36:42] = real[:20, 36:42] = True
+    if side < 0:
+        marked, real = marked[::-1], real[::-1]
+    body = make_body(robot, replace(grid, occupied=real))
+    poses = [(0.8, 1.0 + 0.3 * side, 0.0)]
+    carry = decide(shield, poses, None, True).carry
+    before = Taught.from_bytes(carry.learned)
+    known = revised(before.map, learn(grid, before.map, 0, np.flatnonzero(marked), True, CONTACT))
+    carry = carry._replace(learned=before._replace(map=known).to_bytes())
+    poses.append(poses[0])
+    while len(poses) <= policy.task.horizon + 1:
+        decision = decide(shield, poses, None, True, carry=carry)
+        carry = decision.carry
+        poses.append(step(body, *poses[-1], int(STRETCH.motion_of[decision.action])))
+    assert decision.map_revision > 1
+    assert decision.spec_status == "satisfied"
+
+
 @pytest.mark.parametrize("off", [1, -1])
 def test_what_was_touched_is_first_taken_for_what_the_map_has_a_little_elsewhere(off):
     """A door of 90 cm that is in truth 5 cm farther on one side, and a robot of 70 cm: it touches the frame

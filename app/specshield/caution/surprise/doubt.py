@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from specshield.arrays import Bools, Ints
 from specshield.caution.escape import spread
 from specshield.caution.judgement import Judged, Situation
 from specshield.caution.signals import judged_by_signals
@@ -21,6 +22,7 @@ from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget,
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 BESIDE = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
+AGAIN = 0.2  # [m] from what was touched before; what is nearer may be the same thing. Chosen by hand
 SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
@@ -53,7 +55,8 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
 
     What a sensor sees all around the footprint is the robot itself. A motion that stopped short met
     something, but nobody knows where along its front, nor how large it is. So less is believed than is
-    marked: nothing behind what was touched; only what lies beside the map's own obstacles, which may stand a
+    marked: nothing behind what was touched; of the last contact only what lies beside what was touched
+    before, which may be a little larger; only what lies beside the map's own obstacles, which may stand a
     little elsewhere; only what lies straight ahead; only what lies to the left; only what lies to the right.
     Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
     Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
@@ -63,6 +66,10 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
     held = [marked & np.isin(known.by, some) for some in GUESSES]
     held.insert(1, marked & beside & (known.by != BEHIND))
+    newest = marked & (known.step == known.step[marked].max(initial=-1))
+    same = newest & (known.by != BEHIND) & _is_near(told, known.cell, known.cell[marked & ~newest])
+    if same.any():
+        held.insert(1, (marked & ~newest) | same)
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
@@ -83,6 +90,13 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
         free = learn(told.task.grid, known, t, passed, False, CONTACT)
         if len(free) > len(known):
             yield taught._replace(map=revised(known, free))
+
+
+def _is_near(told: Shield, cells: Ints, others: Ints) -> Bools:
+    """Which cells [n] lie within AGAIN of one of the others [m]."""
+    (y, x), (v, u) = (np.divmod(each, told.task.grid.width) for each in (cells, others))
+    apart = np.hypot(x[:, None] - u, y[:, None] - v).min(axis=1, initial=np.inf)
+    return np.asarray(apart * told.task.grid.resolution <= AGAIN)
 
 
 def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now: Situation) -> Judged:
