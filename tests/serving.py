@@ -222,9 +222,10 @@ def runs(pid: int) -> bool:
 
 
 def command_line(pid: int) -> str:
-    """What it was begun with, as one line. Empty where it has ended."""
+    """What it was begun with, and its name, as one line. Empty where it has ended."""
     with contextlib.suppress(psutil.NoSuchProcess):
-        return " ".join(psutil.Process(pid).cmdline())
+        process = psutil.Process(pid)
+        return " ".join([*process.cmdline(), process.name()])
     return ""
 
 

@@ -4,8 +4,8 @@
 
 A fork takes 10 ms, where a new interpreter needs a second or two of a processor until it serves. What a fork
 runs is the command line, `specshield.cli.main`, with arguments, environment, files and a session of its own.
-The server that a command starts is a fork of the command, and a server's process for heavy work one of the
-server.
+The server that a command starts is a fork of the command, a server's process for heavy work and its worker are
+forks of the server, and the worker's second process one of the worker.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
+import ctypes
 import gc
 import importlib
 import json
@@ -26,9 +27,10 @@ import tempfile
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import IO, Any
 
 import typer
 from PIL import Image
@@ -36,6 +38,7 @@ from PIL import Image
 from specshield import cli
 from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
+from specshield.service.training import children, worker
 from specshield.sim import service
 from tests.serving import READ_AT_IMPORT
 
@@ -146,9 +149,25 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     if arguments[:1] == ["serve"]:
         prepared = _prepared()
         heavy.Template = lambda: prepared  # type: ignore[assignment,misc]
+        if environment.get("SPECSHIELD_WORKER") != "false":
+            children.subprocess = _with(_waiting(prepared._control))
+    elif arguments[:1] == ["worker"]:
+        _name(arguments[-1])
+        if "--learner" not in arguments:
+            worker.subprocess = _with(_waiting())
     else:
-        service.subprocess = SimpleNamespace(**vars(subprocess) | {"Popen": _own_server})  # type: ignore
+        service.subprocess = _with(_own_server)
     cli.main()
+
+
+def _with(popen: Callable[..., Any]) -> Any:
+    """The module `subprocess`, which begins processes this way."""
+    return SimpleNamespace(**vars(subprocess) | {"Popen": popen})
+
+
+def _name(name: str) -> None:
+    """What `tests.serving.command_line` tells of this process: all forks have the template's own arguments."""
+    ctypes.CDLL(None).prctl(15, name.encode())  # PR_SET_NAME
 
 
 def _own_server(command: list[str], **options: Any) -> Any:
@@ -186,6 +205,49 @@ def _prepared() -> pool.Template:
     return prepared
 
 
+def _waiting(control: socket.socket | None = None) -> Callable[..., Any]:
+    """Begins workers. The first has been forked already, while this process has no threads. It ends with this
+    process, and where it is not wanted too. control: of this process alone.
+    """
+    ours, theirs = socket.socketpair()
+    heard, told = os.pipe()
+    forked = Fork()
+    if forked.pid == 0:
+        ours.close()
+        os.close(told)
+        if control is not None:
+            control.close()
+        asked, _held, _, _ = socket.recv_fds(theirs, 1, 8)  # which it holds as long as it runs
+        if not asked:
+            os._exit(0)
+        with theirs.makefile() as lines:
+            command = json.loads(lines.readline())
+        os.dup2(heard, 0)
+        os.setsid()
+        try:
+            _run(**command, stdout="/proc/self/fd/1", stderr="/proc/self/fd/2", cwd=".")
+            code = 0
+        except SystemExit as ended:
+            code = ended.code
+        _finish(code)
+    theirs.close()
+    os.close(heard)
+    forked.stdin = open(told, "wb")
+    used = False
+
+    def begin(command: list[str], **options: Any) -> Any:
+        nonlocal used
+        if used:
+            return subprocess.Popen(command, **options)
+        used = True
+        asked = {"arguments": command[3:], "environment": dict(options.get("env", os.environ))}
+        socket.send_fds(ours, [b"."], options["pass_fds"])
+        ours.sendall(json.dumps(asked).encode() + b"\n")
+        return forked
+
+    return begin
+
+
 def _finish(code: Any) -> None:
     """As an interpreter ends that does not take its modules apart at last. That would write to all the memory
     that is shared with the template: 60 ms of a processor.
@@ -206,6 +268,8 @@ def _end(code: Any) -> None:
 
 class Fork:
     """A child of this process. It has of a Popen what is used."""
+
+    stdin: IO[bytes]
 
     def __init__(self) -> None:
         self.pid = os.fork()

@@ -23,8 +23,8 @@ TASK = flat("F[0,12] West and F[8,20] not West and G[0,10] not Hole")
 @pytest.fixture(scope="module")
 def policy():
     settings = Settings(
-        units=32, updates=1000, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
-        replay=80_000, evaluate_every=500, evaluation_starts=100,
+        units=32, updates=400, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
+        replay=80_000, evaluate_every=200, evaluation_starts=100,
     )  # fmt: skip
     return train(TASK, settings, Run())
 

@@ -88,7 +88,7 @@ def test_v_is_never_above_what_the_best_policy_has(formula, make):
 def test_the_rule_is_kept_as_often_as_was_asked(asked, slip):
     cells = Cells(RULE, None, REGIONS)
     config = Config(threshold=asked, threshold_over="episode", uncertainty=Uncertainty(0.0, 0.0, slip))
-    shield, kept, runs = make_shield([synthesise(cells.task)], config), 0, 400
+    shield, kept, runs = make_shield([synthesise(cells.task)], config), 0, 200
     for run in range(runs):
         random, history, carry = np.random.default_rng(run), [cells.pose(0, 0, 0)], None
         shield = make_shield(shield.proposers, Config(**{**vars(config), "seed": run}))
@@ -96,11 +96,13 @@ def test_the_rule_is_kept_as_often_as_was_asked(asked, slip):
             logits = np.append(random.normal(0.0, 2.0, 3), [0.0, -np.inf])
             found = decide(shield, history, logits, carry=carry)
             assert 0.0 <= found.threshold_left <= 1.0
+            if found.spec_status != "pending":  # whatever comes
+                break
             carry, state = found.carry, cells.state(history[-1])
             state = state if random.random() < slip else cells.after(state, found.action)
             history.append(cells.pose(*state))
         kept += close(shield, history)[0] == "satisfied"
-    spread = 2.6 * np.sqrt(asked * (1.0 - asked) / runs)
+    spread = 1.8 * np.sqrt(asked * (1.0 - asked) / runs)
     assert kept / runs >= asked - spread
     assert kept / runs <= asked + spread + 0.05
 
