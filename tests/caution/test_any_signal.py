@@ -73,6 +73,16 @@ GAMES = {
         lambda w, s: any((s[t][0] and w[t] == A) or w[t] == B for t in range(1, 5)),
     ),
 }
+# How many samples, from step 0 on, the rule looks at. The later ones are drawn.
+LISTENS = {
+    "a call": 4,
+    "a call, and a visit": 3,
+    "a call, and a place in the way": 3,
+    "a call, and a patrol": 3,
+    "two calls": 3,
+    "a call that forbids": 4,
+    "a call that only helps": 5,
+}
 EACH = pytest.mark.parametrize("name", list(GAMES))
 STARTS = [(i, j, h) for i, j in ((0, 2), (1, 2), (2, 1), (2, 2)) for h in range(4)]
 
@@ -156,13 +166,13 @@ def test_a_start_that_is_guaranteed_is_kept_under_every_signal_that_there_is(nam
         if not wins:
             continue
         won += 1
-        for n, samples in enumerate(itertools.product(game.samples, repeat=cells.task.horizon + 1)):
-            if (n + won) % 6 and len(game.samples) > 2:  # of the many, each from every sixth start
-                continue
-            assert _kept(cells, shield, start, samples, n)
+        random = np.random.default_rng(won)
+        for n, samples in enumerate(itertools.product(game.samples, repeat=LISTENS[name])):
+            rest = random.integers(len(game.samples), size=cells.task.horizon + 1 - len(samples))
+            assert _kept(cells, shield, start, (*samples, *(game.samples[i] for i in rest)), n)
             played += 1
-    assert played > 100
-    assert won >= 6  # so no signal is left out
+    assert played == won * len(game.samples) ** LISTENS[name]
+    assert won >= 6
 
 
 def _kept(cells, shield, start, samples, seed):
@@ -212,6 +222,7 @@ def test_sessions_that_take_signals_to_stay_as_they_are_say_nothing_of_others():
     assert decide(silent, [cells.pose(1, 2, 0)], np.zeros(5)).any_signal is None
 
 
+BATTERIES = [50.0] * 6, [50.0, 50.0, *[9.0] * 4], [50.0, 9.0, *[50.0] * 4]
 GUARDED = "G[0,2] (call > 0.5 -> F[0,3] A) and G[0,5] (not C and battery > 10)"
 
 
@@ -226,9 +237,10 @@ def test_what_no_motion_changes_leaves_the_rest_guarded_against_signals_and_kept
         if not all(game.wins(STATES.index(start), (start[:2],), (sample,)) for sample in game.samples):
             continue
         assert any_signal(shield, cells.pose(*start)[None]) is False
-        for n, calls in enumerate(itertools.product((0.0, 1.0), repeat=6)):
-            battery = ([50.0] * 6, [50.0, 50.0, *[9.0] * 4], [50.0, 9.0, *[50.0] * 4])[n % 3]
-            told = {"call": np.array(calls), "battery": np.array(battery)}
+        each = itertools.product(itertools.product((0.0, 1.0), repeat=3), BATTERIES)
+        for n, (calls, battery) in enumerate(each):
+            calls = (*calls, *np.random.default_rng(n).integers(2, size=3))  # at which the rule does not look
+            told = {"call": np.array(calls, float), "battery": np.array(battery)}
             random, poses, carry, statuses = np.random.default_rng(n), [cells.pose(*start)], None, []
             for t in range(5):
                 now = {name: values[: t + 1] for name, values in told.items()}

@@ -21,6 +21,7 @@ from specshield.stl import (
     robustness,
     robustness_bounds,
 )
+from tests.oracles.brute_stl import brute_robustness
 from tests.oracles.cells import Cells
 
 RULES = [
@@ -102,7 +103,7 @@ def met_early(formula, start, samples, t, early):
         case Not(Until(a, b, left, right)):  # its window is not asked for early
             left, right = at(normal(left, True), range(b)), at(normal(right, True), range(b + 1))
             return min(max([right[k], *left[:k]]) for k in range(a, b + 1))
-    rho = float(robustness(formula, {name: samples[name][start : start + 1] for name in formula.names}))
+    rho = brute_robustness(formula, samples, start)
     return rho if start > t else math.copysign(math.inf, rho if rho > SATISFIED_ABOVE else -1.0)
 
 
@@ -178,7 +179,7 @@ def by_visits(formula, steps, samples, t, enough, unseen=None, sought=False):
                 return min(values) if isinstance(formula, And) else max(values)
         if start > t and unseen is not None:
             return unseen
-        rho = float(robustness(formula, {name: samples[name][start : start + 1] for name in formula.names}))
+        rho = brute_robustness(formula, samples, start)
         if start > t or (sought and SATISFIED_ABOVE < rho <= enough):
             return rho
         return math.copysign(math.inf, rho if rho > SATISFIED_ABOVE else -1.0)

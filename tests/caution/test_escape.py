@@ -48,8 +48,10 @@ def policy_of(method):
 
 
 @pytest.mark.parametrize("method", ["reachability", "dqn", "planner"])
-@pytest.mark.parametrize("pose", [(6.65, 4.7, 0.0), (6.45, 4.7, 0.0), (6.7, 5.2, -0.5)])
-@pytest.mark.parametrize("when", [0, 20])
+@pytest.mark.parametrize(
+    ("pose", "when"),
+    [((6.65, 4.7, 0.0), 0), ((6.65, 4.7, 0.0), 20), ((6.45, 4.7, 0.0), 0), ((6.7, 5.2, -0.5), 20)],
+)
 def test_it_leaves_at_once_and_keeps_the_rest(method, pose, when):
     shield, random = make_shield([policy_of(method)]), np.random.default_rng(3)
     x, history, carry = ELSEWHERE, [], None

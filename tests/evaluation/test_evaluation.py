@@ -202,7 +202,8 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
 
 
 def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):
-    monkeypatch.setattr(calibration, "RUNS", 19)
+    monkeypatch.setattr(calibration, "RUNS", 9)
+    monkeypatch.setattr(calibration, "ALPHA", 0.1)  # which asks for 9 at least
     asked = "ours@conformal/8"
     chosen = calibration.calibrated(EXPERIMENT, asked, tmp_path, 1)
     kept = json.loads((tmp_path / "calibration.json").read_text())["conformal/8"]
