@@ -36,11 +36,14 @@ import typer
 from PIL import Image
 
 from specshield import cli
+from specshield.lookahead.preferences import PREFERENCES
+from specshield.policy.methods import METHODS
 from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
 from specshield.service.training import children, worker
 from specshield.sim import service
-from tests.serving import READ_AT_IMPORT
+from specshield.world.formats import FORMATS
+from tests.serving import ADDED, READ_AT_IMPORT
 
 SERVER = (
     "anyio._backends._asyncio",
@@ -142,6 +145,8 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     os.environ.clear()
     os.environ.update(environment)
     tempfile.tempdir = None  # TMPDIR is another one now
+    if ADDED in environment:
+        _add(environment[ADDED])
     sys.argv = ["specshield", *arguments]
     main_module = sys.modules["__main__"]
     main_module.__spec__ = main_module.__package__ = None  # which `python -m` has set
@@ -158,6 +163,16 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     else:
         service.subprocess = _with(_own_server)
     cli.main()
+
+
+def _add(folder: str) -> None:
+    """Packages in this folder are installed too, here and in whatever process is begun from here."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+        path = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
+        os.environ["PYTHONPATH"] = BEGUN_WITH["PYTHONPATH"] = path
+        for registry in (METHODS, FORMATS, PREFERENCES):
+            vars(registry).pop("_points", None)  # which it has read already
 
 
 def _with(popen: Callable[..., Any]) -> Any:

@@ -24,7 +24,7 @@ from specshield.commands import doctor
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
-from tests.serving import HUNG, Forked, free_port, run_specshield, serving, wait_for
+from tests.serving import ADDED, HUNG, Forked, free_port, run_specshield, serving, wait_for
 from tests.stores import answers, running
 
 
@@ -80,11 +80,10 @@ def test_a_file_that_is_no_map_is_told_in_one_line(content, tmp_path):
 def test_a_map_of_another_packages_format_may_be_a_file(tmp_path):
     """As the API takes it in JSON, with its `format`; by the command's own server."""
     added = Path(__file__).parents[1] / "registry_example"
-    path = os.pathsep.join([str(added), *filter(None, [os.environ.get("PYTHONPATH")])])
     rows = ["#" * 30, *(["#" + "." * 28 + "#"] * 20), "#" * 30]
     (tmp_path / "flat.json").write_text(json.dumps({"format": "drawing", "rows": rows}))
     asked = ("--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 0.5", "--method", "ahead")
-    own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data"), "PYTHONPATH": path}
+    own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data"), ADDED: str(added)}
     made = run_specshield("policy", *asked, "--out", tmp_path, **own)
     assert "3.0 x 2.2 m at 0.1 m; rooms: Everywhere" in made.stdout, made.stderr
 

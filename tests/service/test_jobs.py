@@ -22,14 +22,13 @@ from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, _alive
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import HUNG, children, command_line, free_port, runs, serving, wait_for
+from tests.serving import ADDED, HUNG, children, command_line, free_port, runs, serving, wait_for
 from tests.stores import DURABLE, answers, running
 
 pytest.importorskip("torch")
 
 LEARNING = Path(__file__).parents[1] / "learning_example"
-PATH = os.pathsep.join([str(LEARNING), *filter(None, [os.environ.get("PYTHONPATH")])])
-PATIENT = {"SPECSHIELD_WORKER": "true", "PYTHONPATH": PATH}
+PATIENT = {"SPECSHIELD_WORKER": "true", ADDED: str(LEARNING)}
 TINY = {
     "updates": 20,
     "robots": 16,
