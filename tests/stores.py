@@ -189,3 +189,9 @@ def answers(node: redis.Redis) -> bool:
         return bool(node.ping())
     except redis.ConnectionError:
         return False
+
+
+def store_pid(data_dir: Path) -> int:
+    """The process of the embedded store in a data folder."""
+    with redis.Redis(unix_socket_path=str(data_dir / "store" / "socket")) as connection:
+        return int(connection.info("server")["process_id"])

@@ -4,8 +4,8 @@
 
 A fork takes 10 ms, where a new interpreter needs a second or two of a processor until it serves. What a fork
 runs is the command line, `specshield.cli.main`, with arguments, environment, files and a session of its own.
-The server that a command starts is a fork of the command, a server's process for heavy work and its worker are
-forks of the server, and the worker's second process one of the worker.
+The server that a command starts is a fork of the command, a server's process for heavy work and its worker
+are forks of the server, and the worker's second process one of the worker.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def _with(popen: Callable[..., Any]) -> Any:
 
 
 def _name(name: str) -> None:
-    """What `tests.serving.command_line` tells of this process: all forks have the template's own arguments."""
+    """What `tests.serving.command_line` tells of this process: all forks have the template's arguments."""
     ctypes.CDLL(None).prctl(15, name.encode())  # PR_SET_NAME
 
 
@@ -247,7 +247,7 @@ def _waiting(control: socket.socket | None = None) -> Callable[..., Any]:
         _finish(code)
     theirs.close()
     os.close(heard)
-    forked.stdin = open(told, "wb")
+    forked.stdin = os.fdopen(told, "wb")
     used = False
 
     def begin(command: list[str], **options: Any) -> Any:

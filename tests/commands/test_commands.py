@@ -24,6 +24,7 @@ from specshield.commands import doctor
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
+from tests.service.world import grid_json
 from tests.serving import ADDED, HUNG, Forked, free_port, run_specshield, serving, wait_for
 from tests.stores import answers, running
 
@@ -136,7 +137,8 @@ def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_
 
 
 def test_a_rule_that_no_start_can_keep_is_not_to_be_run(tmp_path):
-    asked = ("--map", "case1", "--rule", "F[0,9] x > 99", "--out", tmp_path)
+    (tmp_path / "flat.json").write_text(json.dumps(grid_json()))
+    asked = ("--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 99", "--out", tmp_path)
     made = run_specshield("policy", *asked, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert made.returncode == 1
     assert made.stdout.splitlines()[-1].startswith("next    another rule or map")

@@ -4,7 +4,9 @@ import json
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.browsing import needs_chromium
 from tests.serving import HUNG
@@ -133,7 +135,8 @@ def test_a_name_that_is_made_to_point_here_is_misdirected(client, browse):
     assert "case1" not in seen
 
 
-def test_its_pages_work_behind_a_proxy_with_a_path_of_its_own(client, browse):
+def test_the_docs_work_without_the_internet_behind_a_proxy_with_a_path_of_its_own(client, browse, tmp_path):
+    """A browser that reaches nothing but the server draws the page."""
     elsewhere = []
 
     def pass_on(route):
@@ -147,8 +150,15 @@ def test_its_pages_work_behind_a_proxy_with_a_path_of_its_own(client, browse):
     with browse() as (page, complaints):
         page.route("**", pass_on)
         page.goto("http://proxy.example/robots/docs")
+        for shown in ("Decide one step", "Check a formula", "Send a map"):
+            page.get_by_text(shown, exact=True).first.wait_for()
+        assert "/v1/sessions/{session_id}/steps" in page.content().replace("\u200b", "")
+        page.screenshot(path=tmp_path / "docs.png")
         page.get_by_text("Is it alive?").click()
         page.get_by_role("button", name="Execute").click()
         page.locator(".live-responses-table").wait_for()
         assert '"status": "ok"' in page.locator(".live-responses-table").inner_text()
     assert (elsewhere, complaints) == ([], [])
+    drawn = np.asarray(Image.open(tmp_path / "docs.png").convert("L"))
+    assert (drawn < 128).mean() > 0.005  # text
+    assert len(np.unique(drawn)) > 50

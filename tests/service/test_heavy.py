@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Future
 from contextvars import copy_context
 from pathlib import Path
@@ -34,23 +34,30 @@ from tests.serving import HUNG, children, wait_for
 
 def run(
     scenario: Callable[[Pool], Awaitable[Any]],
+    template: Template,
     size: int = 1,
     idle: float = 60.0,
     unused: Callable[[float], object] = lambda since: None,
 ) -> Any:
     async def whole() -> Any:
-        template = Template()
         pool = Pool(template, size=size, memory=1 << 30, nice=1, waiting=4, idle=idle, unused=unused)
         try:
             return await scenario(pool)
         finally:
             pool.close()
-            template.stop()
 
     return asyncio.run(whole())
 
 
-def test_children_answer_fail_run_out_and_are_replaced() -> None:
+@pytest.fixture(scope="module")
+def template() -> Iterator[Template]:
+    """One for all pools: to start it takes a second of a processor."""
+    template = Template()
+    yield template
+    template.stop()
+
+
+def test_children_answer_fail_run_out_and_are_replaced(template: Template) -> None:
     async def scenario(pool: Pool) -> None:
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
         first = await pool.run("os:getpid", seconds=60.0)
@@ -79,10 +86,10 @@ def test_children_answer_fail_run_out_and_are_replaced() -> None:
             await pool.run("os:abort", seconds=60.0)
         assert await pool.run("math:sqrt", 4.0, seconds=60.0) == 2.0
 
-    run(scenario)
+    run(scenario, template)
 
 
-def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end() -> None:
+def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end(template: Template) -> None:
     async def scenario(pool: Pool) -> int:
         pid: int = await pool.run("os:getpid", seconds=60.0)
         sleeping = asyncio.create_task(pool.run("time:sleep", 600.0, seconds=600.0))
@@ -95,11 +102,11 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
         await _ends(pid)
         return other
 
-    left = run(scenario)
+    left = run(scenario, template)
     asyncio.run(_ends(left))
 
 
-def test_a_child_that_was_stopped_ends_when_its_time_is_over() -> None:
+def test_a_child_that_was_stopped_ends_when_its_time_is_over(template: Template) -> None:
     async def scenario(pool: Pool) -> None:
         pid: int = await pool.run("os:getpid", seconds=60.0)
         os.kill(pid, signal.SIGSTOP)
@@ -107,10 +114,10 @@ def test_a_child_that_was_stopped_ends_when_its_time_is_over() -> None:
             await pool.run("math:sqrt", 9.0, seconds=0.2)
         await _ends(pid)
 
-    run(scenario)
+    run(scenario, template)
 
 
-def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> None:
+def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced(template: Template) -> None:
     async def scenario(pool: Pool) -> None:
         pid: int = await pool.run("os:getpid", seconds=60.0)
         os.kill(pid, signal.SIGKILL)
@@ -119,7 +126,7 @@ def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> Non
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0  # and it is not called too expensive
         assert pool.children == 1
 
-    run(scenario)
+    run(scenario, template)
 
 
 # A template that can fork at its first and third try.
@@ -138,35 +145,40 @@ child.template(socket.socket(fileno=os.dup(0)))
 
 
 def test_where_no_child_can_be_begun_the_caller_is_told_so_and_other_calls_go_on() -> None:
+    template = Template()
+
     async def scenario(pool: Pool) -> None:
-        pool.template._control, theirs = socket.socketpair()
+        template._control, theirs = socket.socketpair()
         with theirs:
-            pool.template._process = subprocess.Popen([sys.executable, "-c", FULL_AT_TIMES], stdin=theirs)
+            template._process = subprocess.Popen([sys.executable, "-c", FULL_AT_TIMES], stdin=theirs)
         long = asyncio.create_task(pool.run("time:sleep", 600.0, seconds=600.0))
-        await asyncio.to_thread(wait_for, lambda: pool.children and children(pool.template._process.pid))
+        await asyncio.to_thread(wait_for, lambda: pool.children and children(template._process.pid))
         with pytest.raises(Busy):
             await pool.run("math:sqrt", 9.0, seconds=60.0)
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
         assert not long.done()
         assert pool.children == 2
 
-        pool.template._process.kill()
+        template._process.kill()
         assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
         assert not long.done()  # it was not too expensive, and is made once more
         long.cancel()
         await asyncio.gather(long, return_exceptions=True)
 
-    run(scenario, size=2)
+    try:
+        run(scenario, template, size=2)
+    finally:
+        template.stop()
 
 
-def test_a_call_whose_child_was_killed_is_made_once_more(tmp_path: Path) -> None:
+def test_a_call_whose_child_was_killed_is_made_once_more(template: Template, tmp_path: Path) -> None:
     once = f"mkdir {tmp_path / 'first'} 2> /dev/null && kill -9 $PPID; exit 3"
 
     async def scenario(pool: Pool) -> None:
         assert await pool.run("subprocess:call", ["sh", "-c", once], seconds=60.0) == 3
         assert pool.children == 1
 
-    run(scenario)
+    run(scenario, template)
 
 
 def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFixture[str]) -> None:
@@ -186,7 +198,7 @@ def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFi
     assert capfd.readouterr().err == ""
 
 
-def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends() -> None:
+def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends(template: Template) -> None:
     unused = list[float]()  # since when, each time that no child was left
 
     async def scenario(pool: Pool) -> None:
@@ -201,7 +213,7 @@ def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends() -> None:
         assert len(await pool.run("operator:mul", b"a", 100 << 20, seconds=60.0)) == 100 << 20
         await _ends(pid)
 
-    run(scenario, idle=0.05, unused=unused.append)
+    run(scenario, template, idle=0.05, unused=unused.append)
 
 
 def test_owners_take_turns() -> None:

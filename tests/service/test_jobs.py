@@ -182,10 +182,10 @@ def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, c
 
 def test_a_run_that_takes_too_long_says_so_and_what_lengthens_its_limit(tmp_path):
     with (
-        serving(tmp_path, SPECSHIELD_WORKER="true", SPECSHIELD_TRAINING_TIMEOUT="2") as server,
+        serving(tmp_path, **PATIENT, SPECSHIELD_TRAINING_TIMEOUT="2") as server,
         httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
     ):
-        policy = ask(client, options=LONG)
+        policy = ask(client, **LATER)
         wait_for(lambda: read(client, policy)["status"] == "failed")
         error = read(client, policy)["error"]
     assert "more than the 2 s" in error
@@ -324,9 +324,9 @@ def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait
 
 
 def test_nothing_trains_on_without_its_server(tmp_path):
-    with serving(tmp_path, SPECSHIELD_WORKER="true") as server:
+    with serving(tmp_path, **PATIENT) as server:
         with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
-            policy = ask(client, options=LONG)
+            policy = ask(client, **LATER)
             reach(client, policy, "training")
         worker, learner = worker_of(server), learner_of(server)
         (run,) = children(learner)

@@ -146,6 +146,8 @@ def test_of_several_processes_none_that_is_not_ready_answers_once_the_server_is(
             mark.touch()
         wait_for(lambda: 200 in said("/readyz"))
         assert said("/readyz") | said("/v1/sessions") == {200}
+        assert not compiling(incomplete)  # nor what few need, as it was told
+    assert "in the background" not in server.log.read_text()
 
 
 def test_what_an_earlier_start_compiled_counts(tmp_path, monkeypatch):
@@ -200,13 +202,6 @@ def test_decisions_are_made_elsewhere_until_the_kernels_that_only_they_need_are_
     assert not shields.slow_policies([learned])
     assert not shields.slow(session, False)
     assert Startup().has("dqn")  # a server that is not to compile it
-
-
-def test_a_server_that_is_not_to_does_not_compile_what_few_need(tmp_path, incomplete):
-    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete), SPECSHIELD_COMPLETE="False") as server:
-        time.sleep(4 * CHECK_EVERY)
-        assert not compiling(incomplete)
-    assert "in the background" not in server.log.read_text()
 
 
 def test_a_server_told_to_stop_while_it_compiles_what_few_need_leaves_nothing_running(tmp_path, incomplete):

@@ -5,9 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -16,12 +14,12 @@ import pytest
 import redis
 
 from specshield.errors import StoreError
-from specshield.service.leaving import COUNTS, folder_of_counts
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import INDEX, Change, Record, Store, keys
 from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
-from tests.serving import children, runs, serving, wait_for
+from tests.serving import runs, serving, wait_for
+from tests.stores import store_pid
 
 
 def begin(client, **options):
@@ -35,11 +33,6 @@ def begin(client, **options):
 def step(client, session, t, **fields):
     body = {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS, **fields}
     return client.post(f"/v1/sessions/{session['id']}/steps", json=body)
-
-
-def store_pid(data_dir):
-    with redis.Redis(unix_socket_path=str(data_dir / "store" / "socket")) as connection:
-        return connection.info("server")["process_id"]
 
 
 def keeper_pid(data_dir):
@@ -160,36 +153,6 @@ def test_two_servers_share_one_store_and_one_step_has_one_answer(tmp_path):
         assert b.get("/v1/sessions").json() == a.get("/v1/sessions").json()
         one.kill()  # it started the store; the other still uses it
         assert step(b, session, 1).status_code == 200
-
-
-def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_supervisor(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # as that of the server
-    with serving(tmp_path, "--workers", "2") as server:
-        with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
-            session = begin(client)
-        answers = [
-            httpx.post(
-                f"{server.url}/v1/sessions/{session['id']}/steps", json=body, timeout=None, verify=False
-            ).content
-            for body in [STEP] * 8
-        ]
-        assert len(set(answers)) == 1
-        told = httpx.get(f"{server.url}/metrics", timeout=None, verify=False).text
-        assert 'specshield_decisions_total{mode="shaped"} 1.0' in told
-        route = 'method="POST",route="/v1/sessions/{session_id}/steps",status="200"'
-        assert f"specshield_requests_total{{{route}}} 8.0" in told
-        pids = [store_pid(tmp_path), *children(server.process.pid)]
-        assert len(pids) >= 3
-        with folder_of_counts() as own:
-            (folder,) = {str(each) for each in tmp_path.glob(f"{COUNTS}*")} - {own}  # that of the server
-            server.kill()
-            wait_for(lambda: not any(map(runs, pids)))
-            with folder_of_counts():
-                assert (Path(own).exists(), Path(folder).exists()) == (True, False)
-        assert not list(tmp_path.glob(f"{COUNTS}*"))
-
-
-STEP = {"t": 0, "poses": [START], "logits": LOGITS}
 
 
 def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):

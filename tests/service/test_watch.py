@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +19,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from specshield import __version__
-from tests.serving import RunningServer, children, command_line, serving, wait_for
+from specshield.service.leaving import COUNTS, folder_of_counts
+from tests.serving import RunningServer, children, command_line, runs, serving, wait_for
+from tests.stores import store_pid
 
 START, LOGITS = [4.5, 5.0, 0.0], [0.0] * 20
 SECRET = "a-key-that-no-line-may-hold"
@@ -56,7 +59,10 @@ def workers(server: RunningServer) -> list[int]:
     return [pid for pid in children(server.process.pid) if "spawn_main" in command_line(pid)]
 
 
-def test_what_several_processes_count_is_true_and_outlives_each_of_them(tmp_path):
+def test_what_several_processes_count_is_true_and_outlives_each_of_them_but_not_the_server(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # as that of the server
     with serving(tmp_path, "--workers", "2", SPECSHIELD_LOG_FORMAT="json") as server:
         ready(server, 2)
 
@@ -105,6 +111,18 @@ def test_what_several_processes_count_is_true_and_outlives_each_of_them(tmp_path
         steps(6)
         counted(12)
         wait_for(lambda: samples(server)["specshield_sessions",] == 13)
+
+        session = begin(server)
+        assert len({decide(server, session).content for _ in range(8)}) == 1  # whichever answers
+        pids = [store_pid(tmp_path), *children(server.process.pid)]
+        assert len(pids) >= 3
+        with folder_of_counts() as own:
+            (folder,) = {str(each) for each in tmp_path.glob(f"{COUNTS}*")} - {own}  # that of the server
+            server.kill()
+            wait_for(lambda: not any(map(runs, pids)))
+            with folder_of_counts():
+                assert (Path(own).exists(), Path(folder).exists()) == (True, False)
+        assert not list(tmp_path.glob(f"{COUNTS}*"))
 
 
 def test_a_line_tells_who_asked_and_never_what_must_not_be_told(tmp_path):
