@@ -47,6 +47,14 @@ def serial():
     return evaluate(EXPERIMENT, RUNS, METHODS)
 
 
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """A folder with the first run of each method."""
+    folder = tmp_path_factory.mktemp("first")
+    evaluate(EXPERIMENT, 1, METHODS, folder)
+    return folder
+
+
 def test_runs_share_all_but_the_method(serial):
     assert [(r.run, r.method) for r in serial] == [(i, name) for i in range(RUNS) for name in METHODS]
     for plain, shielded in zip(serial[::2], serial[1::2], strict=True):
@@ -112,8 +120,10 @@ def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"x", b"[]", b'{"run": 0}', b"\xff", b"\x00"])
-def test_a_damaged_run_is_told_by_its_line_and_made_again_once_that_is_deleted(serial, tmp_path, damage):
-    evaluate(EXPERIMENT, 1, METHODS, tmp_path)
+def test_a_damaged_run_is_told_by_its_line_and_made_again_once_that_is_deleted(
+    serial, first, tmp_path, damage
+):
+    shutil.copytree(first, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "runs.jsonl"
     whole = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(damage + b"\n" + whole[1])
@@ -124,8 +134,8 @@ def test_a_damaged_run_is_told_by_its_line_and_made_again_once_that_is_deleted(s
     assert same(evaluate(EXPERIMENT, 1, METHODS, tmp_path)) == same(serial[:2])
 
 
-def test_runs_of_which_nothing_says_the_experiment_are_not_taken_for_this_one(tmp_path):
-    evaluate(EXPERIMENT, 1, METHODS[:1], tmp_path)
+def test_runs_of_which_nothing_says_the_experiment_are_not_taken_for_this_one(first, tmp_path):
+    shutil.copytree(first, tmp_path, dirs_exist_ok=True)
     (tmp_path / "experiment.json").unlink()
     with pytest.raises(InputError, match=r"has runs, and no experiment\.json"):
         evaluate(Experiment("case1", seed=6), 1, METHODS[:1], tmp_path)

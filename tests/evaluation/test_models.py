@@ -110,7 +110,7 @@ def test_where_the_jumper_goes_and_when_is_the_same_wherever_it_is(case):
 
 def test_the_decoyed_turns_to_its_target_once_it_has_been_about_its_decoy_for_long(case):
     model, stays = Decoyed(case), []
-    for seed in range(40):
+    for seed in range(15):
         model.reset(np.random.default_rng(seed))
         decoy = model._decoy
         away = next(place for place in elsewhere(case, 2) if decoy.distance[case.cell(place.target)] > NEAR)

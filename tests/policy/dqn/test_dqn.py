@@ -20,7 +20,7 @@ from tests.policy.rooms import flat
 
 TASK = flat("F[0,30] West and G[0,30] not Hole")
 SMALL = Settings(
-    units=32, updates=1500, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
+    units=32, updates=1200, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
     replay=80_000, evaluate_every=300, evaluation_starts=200,
 )  # fmt: skip
 TINY = replace(SMALL, updates=40, robots=16, batch=32, replay=2000, evaluate_every=20, evaluation_starts=20)
@@ -40,10 +40,10 @@ def test_a_short_training_beats_chance_clearly():
     low, high = metrics["satisfied_interval"]
     assert low < metrics["satisfied"] < high
     assert metrics["wall_time_s"] > 0
-    assert [done for done, _, _ in reports] == [update / 1500 for update in range(100, 1501, 100)]
+    assert [done for done, _, _ in reports] == [update / 1200 for update in range(100, 1201, 100)]
     assert reports[-1][1] == 0.0
-    assert reports[1][2] == "update 200 of 1500, not measured yet"
-    assert re.fullmatch(r"update 300 of 1500, satisfied [0-9]{1,3}\.[0-9]%", reports[2][2])
+    assert reports[1][2] == "update 200 of 1200, not measured yet"
+    assert re.fullmatch(r"update 300 of 1200, satisfied [0-9]{1,3}\.[0-9]%", reports[2][2])
     again = load_policy(policy.weights(), policy.card, TASK)
     assert same(again.network._asdict(), policy.network._asdict())
     assert read_options(Settings, policy.card["options"]) == SMALL
