@@ -141,7 +141,9 @@ def free_port() -> int:
 # one on a cluster: `specshield.service.training` looks for that, and for no other store, at its import.
 READ_AT_IMPORT = {"NUMBA_CACHE_DIR", "PYTHONPATH", "SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR"}
 
-ADDED = "ADDED_PACKAGES"  # a variable with a folder of packages that a fork finds as if they were installed
+# Variables for forks: a folder of packages that are found as if they were installed, and whether the
+# processes that drive a command's robots are forked too.
+ADDED, ROBOTS = "ADDED_PACKAGES", "FORKED_ROBOTS"
 
 
 @contextmanager

@@ -29,6 +29,7 @@ import time
 import traceback
 from collections.abc import Callable
 from functools import cache
+from multiprocessing import get_context
 from types import SimpleNamespace
 from typing import IO, Any
 
@@ -41,9 +42,9 @@ from specshield.policy.methods import METHODS
 from specshield.service.heavy import child, heavy, pool
 from specshield.service.startup import Startup, prepare
 from specshield.service.training import children, worker
-from specshield.sim import service
+from specshield.sim import campaign, service
 from specshield.world.formats import FORMATS
-from tests.serving import ADDED, READ_AT_IMPORT
+from tests.serving import ADDED, READ_AT_IMPORT, ROBOTS
 
 SERVER = (
     "anyio._backends._asyncio",
@@ -162,6 +163,8 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
             worker.subprocess = _with(_waiting())
     else:
         service.subprocess = _with(_own_server)
+        if ROBOTS in environment:
+            campaign.get_context = lambda _: get_context("fork")  # type: ignore[assignment,return-value]
     cli.main()
 
 

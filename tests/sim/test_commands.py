@@ -10,7 +10,7 @@ import pytest
 from specshield.commands.train import _alone_in
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
-from tests.serving import HUNG, Forked, children, run_specshield, runs, wait_for
+from tests.serving import HUNG, ROBOTS, Forked, children, run_specshield, runs, wait_for
 
 
 def specshield(*arguments, code=0, **environment):
@@ -22,7 +22,7 @@ def specshield(*arguments, code=0, **environment):
 def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     """Also where the environment names a proxy, which leads to no server of this machine."""
     asked = ("demo", "--runs", "1", "--seed", "4", "--out", str(tmp_path))
-    done = specshield(*asked, http_proxy="http://127.0.0.1:9")
+    done = specshield(*asked, http_proxy="http://127.0.0.1:9", **{ROBOTS: "yes"})
     assert "1 episodes a case, seed 4" in done.stdout
     assert "rule satisfied" in done.stdout
     assert done.stdout.count("1 of 1") >= 4
@@ -31,17 +31,17 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert "page of both" not in done.stdout  # the service has ended
 
 
-def begun(folder, *arguments):
+def begun(folder, *arguments, **environment):
     """The command, in a session of its own, and the files that it writes to."""
     out, err = folder / "stdout", folder / "stderr"
     out.touch()
     err.touch()
-    return Forked([*arguments], {**os.environ}, stdout=out, stderr=err, cwd=folder), out, err
+    return Forked([*arguments], {**os.environ, **environment}, stdout=out, stderr=err, cwd=folder), out, err
 
 
 def test_demo_leaves_its_page_up_when_asked(tmp_path):
     asked = ("demo", "--runs", "1", "--seed", "4", "--open", "--out", str(tmp_path))
-    running, told, _ = begun(tmp_path, *asked)
+    running, told, _ = begun(tmp_path, *asked, **{ROBOTS: "yes"})
     try:
         wait_for(lambda: "Ctrl-C ends both" in told.read_text() or running.poll() is not None)
         page = next(line for line in told.read_text().splitlines() if line.startswith("page of both"))
