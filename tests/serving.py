@@ -108,17 +108,18 @@ class RunningServer:
 # not even a policy, which its worker makes at a low priority.
 HUNG = 900.0
 
-# Below the ports that Linux gives to outgoing connections (32768 and up), in an order of this process's own.
-_PORTS = itertools.cycle(random.SystemRandom().sample(range(20_000, 32_000), 12_000))
+# A file of which byte P is locked, to its end, by the process of tests that has handed out port P.
+_HANDED_OUT = Path(tempfile.gettempdir(), f"specshield-test-ports-{os.getuid()}")
 
 
 @cache
-def _handed_out() -> IO[bytes]:
-    """A file of which byte P is locked, to its end, by the process of tests that has handed out port P.
-
-    It is opened once: to close any handle of it would give up all locks of this process.
+def _handed_out() -> tuple[Iterator[int], IO[bytes]]:
+    """The ports below those that Linux gives to outgoing connections (32768 and up), in an order of this
+    process's own, and the file. It is opened once: to close any handle of it would give up all locks of this
+    process.
     """
-    return open(Path(tempfile.gettempdir(), f"specshield-test-ports-{os.getuid()}"), "ab")
+    ports = random.SystemRandom().sample(range(20_000, 32_000), 12_000)
+    return itertools.cycle(ports), open(_HANDED_OUT, "ab")
 
 
 def free_port() -> int:
@@ -128,9 +129,10 @@ def free_port() -> int:
     may find the same one free meanwhile. The kernel's own choice (port 0) may be the same twice before the
     first is in use, and may be taken by an outgoing connection of another test.
     """
-    for port in itertools.islice(_PORTS, 12_000):
+    ports, handed_out = _handed_out()
+    for port in itertools.islice(ports, 12_000):
         with socket.socket() as probe, contextlib.suppress(OSError):
-            fcntl.lockf(_handed_out(), fcntl.LOCK_EX | fcntl.LOCK_NB, 1, port)
+            fcntl.lockf(handed_out, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, port)
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(("127.0.0.1", port))
             return port
