@@ -92,15 +92,8 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
 def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     pytest.importorskip("torch")
     case, out = load_case("case1"), tmp_path / "model"
-    arguments = ["train", "--case", "case1", "--method", "dqn", "--seed", "3", "--updates", "80"]
-    for option in (
-        "units=8",
-        "robots=16",
-        "batch=32",
-        "replay=2000",
-        "evaluate_every=20",
-        "evaluation_starts=20",
-    ):
+    arguments = ["train", "--case", "case1", "--method", "dqn", "--seed", "3", "--updates", "400"]
+    for option in ("units=8", "evaluate_every=100", "evaluation_starts=50"):
         arguments += ["--option", option]
     arguments += ["--out", str(out)]
     command, *_ = begun(tmp_path, *arguments)
