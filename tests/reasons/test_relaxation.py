@@ -77,6 +77,66 @@ def test_how_late_an_until_and_a_place_to_be_in_come():
     assert seen >= 4
 
 
+def _from(inside, step):
+    return {name: values[..., step:] for name, values in inside.items()}
+
+
+def _every(steps, window, place, since=0):
+    return lambda s: np.all(
+        [s[place][..., k + since : k + window + 1].any(-1) for k in range(steps + 1)], axis=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("which", "rule"),
+    [
+        (0, lambda late: (f"G[0,4] F[0,{1 + late}] A", _every(4, 1 + late, "A"))),
+        (0, lambda late: (f"G[1,5] F[1,{2 + late}] A", lambda s: _every(4, 2 + late, "A", 1)(_from(s, 1)))),
+        (
+            1,
+            lambda late: (
+                f"F[0,3] D and G[0,4] (D -> F[0,{1 + late}] A)",
+                lambda s: (
+                    s["D"][..., :4].any(-1)
+                    & np.all(
+                        [~s["D"][..., k] | s["A"][..., k : k + 2 + late].any(-1) for k in range(5)], axis=0
+                    )
+                ),
+            ),
+        ),
+        (
+            0,
+            lambda late: (
+                f"F[0,{1 + late}] (A and F[1,3] D)",
+                lambda s: np.any(
+                    [s["A"][..., k] & s["D"][..., k + 1 : k + 4].any(-1) for k in range(2 + late)], axis=0
+                ),
+            ),
+        ),
+    ],
+)
+def test_a_later_end_that_is_named_is_the_first_that_is_enough_and_a_session_begins_with_it(which, rule):
+    """Patrols and responses were read at few of their steps: an end named for them was refused when it was
+    asked for, or was some thirty steps later than it had to be.
+    """
+    places, seen = {name: PLACES[name] for name in ("AD" if "D" in rule(0)[0] else "A")}, set()
+    for i, j, heading in [(0, 0, 2), (3, 0, 0), (2, 2, 1), (0, 2, 3), (1, 0, 1), (4, 1, 0), (0, 1, 2)]:
+        cells = [Cells(*rule(late), places) for late in range(5)]
+        history = np.array([cells[0].pose(i, j, heading)])
+        enough = [bool(each.feasible(history).any()) for each in cells if each.task.horizon <= 8]
+        if enough[0]:
+            continue
+        told = relaxations(make_shield([Scripted(cells[0], waits)]), history, {})
+        late = told.conjuncts[which].late_by
+        seen.add(late)
+        assert late == enough.index(True) if True in enough else late is None or late >= len(enough)
+        if late is not None:
+            eased = Cells(*rule(late), places)
+            feasible, _ = begin(make_shield([Scripted(eased, waits)]), history[0].tolist(), False)
+            assert feasible
+    assert len(seen) >= 2, seen
+
+
 @pytest.mark.parametrize(
     ("part", "keeps"),
     [

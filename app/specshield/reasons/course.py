@@ -34,11 +34,8 @@ class Course(NamedTuple):
     goals: tuple[Goal, ...]
 
 
-def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -> Course | str:
-    """What these needs leave to be done, or why they cannot all be met. late: how many steps later than the
-    formula says they may be met. If that is not 0, distances are measured only through squares that keep the
-    guards: this guides a search better, but is no bound.
-    """
+def course(needs: Sequence[Need], known: Known, ground: Ground) -> Course | str:
+    """What these needs leave to be done after what is known, or why they cannot all be met."""
     pending: list[Need] = []
     for need in needs[:MOST_NEEDS]:
         left = need if need.first > known.now else _left(need, known.past(need.predicate), known.now)
@@ -46,6 +43,11 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
             return f"{need.formula} is broken already"
         if isinstance(left, Need):
             pending.append(left)
+    return course_from(pending, known.now, ground)
+
+
+def course_from(pending: Sequence[Need], now: int, ground: Ground) -> Course | str:
+    """The same for needs that all begin after step `now`."""
     guards = tuple(need for need in pending if need.first == need.last)
     found: list[tuple[Need, Bools]] = []
     for need in pending:
@@ -53,14 +55,15 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
             if not possible(asked, ground).any():
                 return f"{need.formula} asks for '{asked}', which holds nowhere that the robot fits"
         where = possible(_together(need, guards, need.end), ground)
-        begun = need.first == need.last == known.now + 1
+        begun = need.first == need.last == now + 1
         # A predicate that only may hold in every square is to be gone to: a square may lie across its edge.
         everywhere = not possible(positive(need.predicate, True), ground).any()
         if not begun and not everywhere:
             found.append((need, where))
     found = sorted(found, key=lambda goal: int(goal[1].sum()))
-    goals = (Goal(need, where, _far(need, where, guards, known.now, ground, late)) for need, where in found)
-    return Course(guards, tuple(goals))
+    return Course(
+        guards, tuple(Goal(need, where, _far(need, where, guards, now, ground)) for need, where in found)
+    )
 
 
 def possible(predicate: Formula, ground: Ground) -> Bools:
@@ -88,14 +91,14 @@ def _together(need: Need, guards: Sequence[Need], until: int) -> Formula:
     return And(tuple(parts)) if len(parts) > 1 else next(iter(parts))
 
 
-def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground, late: int) -> Floats:
+def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground) -> Floats:
     """How far [m] each square is from the goal at least. Ways keep every guard that holds from the next step
-    until the goal is reached. Unless the goal may be late, they may also lead through squares close by, since
-    a guard says nothing of the way between two steps.
+    until the goal is reached. They may also lead through squares close by, since a guard says nothing of the
+    way between two steps.
     """
-    free, reach = ground.free, 0.0 if late else ground.travel
+    free, reach = ground.free, ground.travel
     for guard in guards:
-        if guard.first <= now + 1 and guard.end >= need.last - late:
+        if guard.first <= now + 1 and guard.end >= need.last:
             free = free & (ground.highest(guard.predicate, reach / 2.0) > SATISFIED_ABOVE)
     if need.before is not None:  # the last step may leave where it holds
         free = free & (where | (ground.highest(need.before, reach) > SATISFIED_ABOVE))

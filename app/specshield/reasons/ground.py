@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Ground:
     span: float
     travel: float
     values: dict[str, float]
+    kept: dict[object, Floats] = field(default_factory=dict)  # what was computed already
 
     def squares(self, poses: Floats) -> tuple[Ints, Ints]:
         """Rows and columns, [n] each, of the squares that the footprint's centre is in at poses [n, 3]."""
@@ -61,8 +62,11 @@ class Ground:
         """An upper bound on rho of a predicate, in the form of `needs.positive`, wherever the footprint's
         centre is in a square or at most `beyond` [m] from it. Shape [ny, nx].
         """
-        kept = frozenset(predicate.children if isinstance(predicate, And) else (predicate,))
-        return self._rho(predicate, kept, beyond)[1]
+        key = predicate, beyond
+        if key not in self.kept:
+            kept = frozenset(predicate.children if isinstance(predicate, And) else (predicate,))
+            self.kept[key] = self._rho(predicate, kept, beyond)[1]
+        return self.kept[key]
 
     def _rho(self, predicate: Formula, kept: frozenset[Formula], beyond: float) -> Interval:
         """Bounds on rho, given that the predicates `kept` hold as well."""
@@ -103,8 +107,11 @@ class Ground:
         """The length [m] of the shortest way from each square to some square of `goal`, through squares that
         are `free`, or less. Infinite where there is none. All of shape [ny, nx].
         """
-        found: Floats = _ways(goal & free, free) * (self.side / LONGER) - math.sqrt(2.0) * self.side
-        return np.maximum(found, 0.0)
+        key = goal.tobytes(), free.tobytes()
+        if key not in self.kept:
+            found = _ways(goal & free, free) * (self.side / LONGER) - math.sqrt(2.0) * self.side
+            self.kept[key] = np.maximum(found, 0.0)
+        return self.kept[key]
 
     def steps(self, ways: Floats) -> Floats:
         """The fewest steps that ways of these lengths [m] take, of any shape."""

@@ -68,6 +68,24 @@ class Reader:
         """The alternatives of a formula at step 0; none where it cannot be satisfied."""
         return self._some(positive(formula), 0, 0)
 
+    def from_step(self, left: Formula, step: int) -> Alternatives:
+        """The alternatives of what is left of a formula (remainder.py) from a step on."""
+        match left:
+            case Or(children):
+                return _any(self.from_step(child, step) for child in children)
+            case And(children):
+                return _all(self.from_step(child, step) for child in children)
+            case Eventually(a, b, child):
+                return self._some(child, max(a, step), b)
+            case Always(a, b, child):
+                return self._every(child, max(a, step), b)
+            case Until(_, b, kept, child):
+                then = self._some(child, step, b)
+                if is_predicate(kept) and is_predicate(child):
+                    then = tuple(tuple(replace(need, before=kept) for need in way) for way in then)
+                return then
+        return NOTHING
+
     def _some(self, formula: Formula, a: int, b: int) -> Alternatives:
         """What is needed for the formula to hold at some step from a to b."""
         if is_predicate(formula):
@@ -154,6 +172,7 @@ def positive(formula: Formula, negated: bool = False) -> Formula:
             inner = positive(child, negated)
             always = isinstance(formula, Always) is not negated
             return Always(a, b, inner) if always else Eventually(a, b, inner)
-        case Until(a, b, left, right) if not negated:
-            return Until(a, b, positive(left), positive(right))
+        case Until(a, b, left, right):
+            until = Until(a, b, positive(left), positive(right))
+            return Not(until) if negated else until
     return Not(formula) if negated else formula

@@ -1,15 +1,17 @@
-"""A search for a future that meets given needs, without policies: step by step, in simulation.
+"""A search for a future that satisfies a formula, without policies: step by step, in simulation.
 
-It begins with every pose that one motion leads to, and goes on from those that leave the most steps to spare
-on the way to the goals (ground.py). It goes on from a place once, when that is first reached, and again when
-some window opens or closes. What it finds is simulated with f and can be judged like any other future. If it
-finds nothing, that proves nothing.
+Each pose that is reached carries what is left of the formula there (remainder.py). The search begins with
+every pose that one motion leads to. For each formula that is left, it goes on from the poses that leave the
+most steps to spare on the way to what that formula needs (needs.py, ground.py). It goes on once from a place
+with the same formula left, since a robot can wait anywhere, and again if waiting has changed what is left.
+What it finds is simulated with f and can be judged like any other future. If it finds nothing, that proves
+nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,28 +19,47 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.caution.escape import spread
+from specshield.reasons.course import Goal, course_from
 from specshield.reasons.ground import Ground
 from specshield.reasons.known import Known
-from specshield.reasons.needs import Need
+from specshield.reasons.needs import Reader, positive
+from specshield.reasons.remainder import Left, after, begun, implies, next_change
 from specshield.robot.dynamics import Body, calmest_motion, motion_count
-from specshield.stl import SATISFIED_ABOVE
+from specshield.stl import SATISFIED_ABOVE, Formula
+from specshield.stl.conjunction import is_predicate
+from specshield.stl.formula import Node
 
 # Chosen by hand: a search takes a second at most.
 MOST_NODES = 60_000
-WIDTH = 120  # poses that one step goes on from, for each set of goals that are met
+MOST_LEFT = 4_000  # different formulas that are left
+MOST_PREDICATES = 62  # their truths at a pose are the bits of one number
+WIDTH = 120  # poses that one step goes on from, for each formula that is left
 MOST_MOTIONS = 1_500  # made from all of these poses
 BEHIND = 8.0  # [steps] such a pose may have fewer to spare than the best one: what it takes to turn round
 CELL, HEADINGS = 0.05, 120  # poses in one cell [m] and one of so many headings are one place
+MOST_WAYS, MOST_GOALS = 4, 8  # alternatives of one formula, and goals of one alternative, that are looked at
+LOST, DONE = 0, 1  # the numbers of False and True among the formulas that are left
 
 
-class Wanted(NamedTuple):
-    """A need that a way has to meet. far [m]: from each of the ground's squares to where it may be met. due:
-    the last step to begin it by, which is later than the need says if that may be late.
+Seen = set[tuple[int, int]]  # places that the search went on from, with what was left there
+
+
+class Place(NamedTuple):
+    """Poses [n, 3] that are reached, each with its node, the number of what is left there, and the truths of
+    the predicates.
     """
 
-    need: Need
-    far: Floats
-    due: int
+    node: Ints
+    poses: Floats
+    left: Ints
+    truths: Ints
+
+    def of(self, which: Ints | Bools) -> Place:
+        return Place(self.node[which], self.poses[which], self.left[which], self.truths[which])
+
+    def and_(self, other: Place) -> Place:
+        node, poses = np.append(self.node, other.node), np.concatenate([self.poses, other.poses])
+        return Place(node, poses, np.append(self.left, other.left), np.append(self.truths, other.truths))
 
 
 @dataclass
@@ -64,104 +85,195 @@ class _Tree:
         return back[::-1]
 
 
-def search(
-    known: Known, ground: Ground, body: Body, guards: Sequence[Need], goals: Sequence[Wanted], until: int
-) -> Ints | None:
-    """Motions from x_t up to step `until` that meet the goals and keep the guards at every step of their
-    windows; None where none were found.
+@dataclass
+class _Lefts:
+    """What may be left of the formula, numbered, and the goals that lead to keeping it."""
+
+    known: Known
+    ground: Ground
+    predicates: tuple[Formula, ...]
+    all: list[Left] = field(default_factory=lambda: [False, True])
+    number: dict[Left, int] = field(default_factory=lambda: {False: LOST, True: DONE})
+    next: dict[tuple[int, int, int], int] = field(default_factory=dict)
+    implied: dict[tuple[int, int], bool] = field(default_factory=dict)
+    goals: dict[int, tuple[int, tuple[tuple[Goal, ...], ...]]] = field(default_factory=dict)
+
+    def numbered(self, left: Left) -> int:
+        if left not in self.number:
+            self.number[left] = len(self.all)
+            self.all.append(left)
+        return self.number[left]
+
+    def truths(self, poses: Floats) -> Ints:
+        bits = np.zeros(len(poses), np.int64)
+        for k, predicate in enumerate(self.predicates):
+            bits |= self.known.at(predicate, poses, SATISFIED_ABOVE).astype(np.int64) << k
+        return bits
+
+    def begun(self) -> int:
+        """What is left after the steps that are known."""
+        past = [self.known.past(each) for each in self.predicates]
+        left: Left = True
+        for step in range(self.known.now + 1):
+            holds = {
+                each: bool(there[min(step, len(there) - 1)])
+                for each, there in zip(self.predicates, past, strict=True)
+            }
+            left = (
+                after(left, step, holds.__getitem__)
+                if step
+                else begun(self.known.task.formula, holds.__getitem__)
+            )
+        return self.numbered(left)
+
+    def after(self, left: Ints, truths: Ints, step: int) -> Ints:
+        """What is left of each [n] after a step with these truths [n]."""
+        pairs, which = np.unique(np.column_stack([left, truths]), axis=0, return_inverse=True)
+        found = [self._after(int(one), int(bits), step) for one, bits in pairs]
+        return np.array(found, np.int64)[which.reshape(-1)]
+
+    def kept_by_waiting(self, left: int, truths: int, step: int) -> bool:
+        """Whether the formula is kept if the predicates hold for ever as they do at this step."""
+        while left not in (LOST, DONE):
+            step += 1
+            further = self._after(left, truths, step)
+            step = max(next_change(self.all[left], step) - 1, step) if further == left else step
+            left = further
+        return left == DONE
+
+    def _after(self, left: int, truths: int, step: int) -> int:
+        key = left, truths, step
+        if key not in self.next:
+            index = {each: k for k, each in enumerate(self.predicates)}
+            found = after(self.all[left], step, lambda each: bool(truths >> index[each] & 1))
+            self.next[key] = self.numbered(found)
+        return self.next[key]
+
+    def asks_more(self, left: int, others: Iterable[int]) -> bool:
+        """Whether what is left asks for as much as one of the others, or more."""
+        for other in others:
+            key = left, other
+            if key not in self.implied:
+                self.implied[key] = implies(self.all[left], self.all[other])
+            if self.implied[key]:
+                return True
+        return False
+
+    def courses(self, left: int, step: int) -> tuple[tuple[Goal, ...], ...]:
+        """The goals of each alternative of what is left after a step; none if it cannot be kept."""
+        until, found = self.goals.get(left, (-1, ()))
+        if step > until:  # a G asks for its child at other steps now
+            formula, reader = self.all[left], Reader(self.known.now, self.known.constant)
+            assert isinstance(formula, Formula)
+            ways = reader.from_step(formula, step + 1)[:MOST_WAYS]
+            asked = [course_from(needs, step, self.ground) for needs in ways]
+            found = tuple(each.goals[:MOST_GOALS] for each in asked if not isinstance(each, str))
+            until = min((goal.need.last for goals in found for goal in goals), default=formula.horizon)
+            self.goals[left] = until, found
+        return found
+
+    def spare(self, left: int, poses: Floats, step: int) -> Floats:
+        """The steps to spare at each pose [n, 3] on the way to what is left; -inf where it is too late."""
+        at, best = self.ground.squares(poses), np.full(len(poses), -np.inf)
+        for goals in self.courses(left, step):
+            spare = np.full(len(poses), np.inf)
+            for goal in goals:
+                slack = goal.need.last - step - self.ground.steps(goal.far[at])
+                spare = np.minimum(spare, np.where(slack < 0.0, -np.inf, slack))
+            best = np.maximum(best, spare)
+        return best
+
+
+def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> Ints | None:
+    """Motions from x_t to the horizon that satisfy the task's formula; None where none were found. most: how
+    many poses are looked at.
     """
-    wait, now, tree = calmest_motion(body), known.now, _Tree()
-    waits = known.task.robot.wait_motion >= 0
-    count, every = motion_count(body), (1 << len(goals)) - 1
-    width = max(1, min(WIDTH, MOST_MOTIONS // count))
-    stays = [k for k, goal in enumerate(goals) if goal.need.stay > 0]
-    events = {goal.need.first for goal in goals} | {s for g in guards for s in (g.first, g.end + 1)}
-    ids = tree.add(now, np.array([-1]), np.array([-1]))
-    poses, met, run = known.history[-1:], np.zeros(1, np.int64), np.zeros((1, len(goals)), np.int64)
-    pool: list[tuple[Ints, Floats, Ints]] = []
-    seen = np.empty(0, np.int64)
+    wait, now, tree, until = calmest_motion(body), known.now, _Tree(), known.task.horizon
+    waits, count = known.task.robot.wait_motion >= 0, motion_count(body)
+    lefts = _Lefts(known, ground, tuple(dict.fromkeys(_predicates(positive(known.task.formula)))))
+    if len(lefts.predicates) > MOST_PREDICATES:
+        return None
+    here = known.history[-1:]
+    nodes = tree.add(now, np.array([-1]), np.array([-1]))
+    last = Place(nodes, here, np.array([lefts.begun()]), lefts.truths(here))
+    pool, seen = last, Seen()
     for step in range(now + 1, until + 1):
-        if step in events and waits and pool:  # a robot that waited anywhere may go on from there
-            ids, poses, met = (np.concatenate(each) for each in zip(*pool, strict=True))
-            run, seen = np.zeros((len(ids), len(goals)), np.int64), np.empty(0, np.int64)
-            chosen = _best(goals, ground, poses, met, run, step - 1, width)
-            ids, poses, met, run = ids[chosen], poses[chosen], met[chosen], run[chosen]
-        parent, motion = np.repeat(ids, count), np.tile(np.arange(count), len(ids))
-        poses, met, run = spread(body, poses), np.repeat(met, count), np.repeat(run, count, axis=0)
-        keep = _kept(known, guards, poses, step)
-        poses, met, run, parent, motion = poses[keep], met[keep].copy(), run[keep], parent[keep], motion[keep]
-        waiting = np.zeros(len(poses), np.bool_)
-        for k, goal in enumerate(goals):
-            holds = known.at(goal.need.predicate, poses, SATISFIED_ABOVE) & (met >> k & 1 == 0)
-            run[:, k] = np.where(holds & (step >= goal.need.first), run[:, k] + 1, 0)
-            met[(run[:, k] > goal.need.stay) & (step - goal.need.stay <= goal.due)] |= 1 << k
-            waiting |= holds & (step < goal.need.first)
-        keep = _so_far(known, goals, poses, met)
-        if not keep.all():
-            poses, met, run, parent, motion = poses[keep], met[keep], run[keep], parent[keep], motion[keep]
-            waiting = waiting[keep]
-        if (met == every).any():
-            node = int(tree.add(step, parent, motion)[np.argmax(met == every)])
-            return np.array(tree.way(node, wait) + [wait] * (until - step), np.int64)
-        key = _key(poses, met, run[:, stays])
-        _, first = np.unique(key, return_index=True)
-        fresh = ~np.isin(key[first], seen) | waiting[first] if waits else np.ones(len(first), np.bool_)
-        chosen = first[fresh]
-        chosen = chosen[_best(goals, ground, poses[chosen], met[chosen], run[chosen], step, width)]
-        if not len(chosen) and not any(event > step for event in events):
+        done = _done(lefts, last, step - 1, waits)
+        if done is not None:
+            way = tree.way(done, wait)
+            return np.array(way + [wait] * (until - now - len(way)), np.int64)
+        poses = spread(body, last.poses)
+        truths = lefts.truths(poses)
+        left = lefts.after(np.repeat(last.left, count), truths, step)
+        moved = Place(np.arange(len(poses)), poses, left, truths)
+        seen = seen if waits else Seen()
+        moved = moved.of(_new(lefts, moved, step, seen))
+        parent, motion = np.divmod(moved.node, count)
+        moved = moved._replace(node=tree.add(step, last.node[parent], motion))
+        if waits:
+            left = lefts.after(pool.left, pool.truths, step)
+            new, pool = left != pool.left, pool._replace(left=left)
+            changed = pool.of(new)
+            last = moved.and_(changed.of(_new(lefts, changed, step, seen)))
+            pool = pool.of(left != LOST).and_(moved)
+        else:
+            last = moved
+        if not len(last.node) and not (waits and len(pool.node)):
             return None
-        poses, met, run = poses[chosen], met[chosen], run[chosen]
-        ids = tree.add(step, parent[chosen], motion[chosen])
-        pool.append((ids, poses, met))
-        seen = np.concatenate([seen, key[chosen]])
-        if tree.size > MOST_NODES:
+        if tree.size > most or len(lefts.all) > MOST_LEFT:
             return None
+    done = _done(lefts, last, until, waits)
+    return None if done is None else np.array(tree.way(done, wait), np.int64)
+
+
+def _predicates(formula: Node) -> Iterator[Formula]:
+    if is_predicate(formula) and isinstance(formula, Formula):
+        yield formula
+        return
+    for part in formula.parts:
+        yield from _predicates(part)
+
+
+def _done(lefts: _Lefts, last: Place, step: int, waits: bool) -> int | None:
+    """The node from which the formula is kept by waiting, or by whatever a robot does that cannot wait."""
+    pairs, first = np.unique(np.column_stack([last.left, last.truths]), axis=0, return_index=True)
+    for (left, truths), at in zip(pairs.tolist(), first.tolist(), strict=True):
+        if left == DONE or (waits and lefts.kept_by_waiting(left, truths, step)):
+            return int(last.node[at])
     return None
 
 
-def _kept(known: Known, guards: Sequence[Need], poses: Floats, step: int) -> Bools:
-    keep = np.ones(len(poses), np.bool_)
-    for guard in guards:
-        if guard.first <= step <= guard.end:
-            keep &= known.at(guard.predicate, poses, SATISFIED_ABOVE)
-    return keep
+def _new(lefts: _Lefts, place: Place, step: int, seen: Seen) -> Ints:
+    """The poses to go on from: for each formula that is left, those with the most steps to spare. Of poses at
+    one place, those where more is left do not count. Adds them to `seen`.
+    """
+    here: dict[int, dict[int, int]] = {}
+    keys, left_at = _key(place.poses).tolist(), place.left.tolist()
+    for row, (key, left) in enumerate(zip(keys, left_at, strict=True)):
+        others = here.get(key, {})
+        if left == LOST or (key, left) in seen or lefts.asks_more(left, others):
+            continue
+        others = here.get(key, {})
+        here[key] = {other: at for other, at in others.items() if not lefts.asks_more(other, (left,))}
+        here[key][left] = row
+    rows = np.sort(np.array([row for found in here.values() for row in found.values()], np.int64))
+    chosen = []
+    width = max(1, min(WIDTH, MOST_MOTIONS // len(lefts.known.task.robot.motions)))
+    for left in np.unique(place.left[rows]).tolist():
+        same = rows[place.left[rows] == left]
+        if left != DONE:
+            spare = lefts.spare(left, place.poses[same], step)
+            order = np.argsort(-spare, kind="stable")
+            same, spare = same[order], spare[order]
+            same = same[(spare > -np.inf) & (spare >= spare[0] - BEHIND)]
+        chosen.append(same[:width])
+    found = np.concatenate(chosen) if chosen else rows
+    seen.update((keys[row], left_at[row]) for row in found.tolist())
+    return found
 
 
-def _so_far(known: Known, goals: Sequence[Wanted], poses: Floats, met: Ints) -> Bools:
-    """Which poses keep what has to hold until a goal is met, unless it is."""
-    keep = np.ones(len(poses), np.bool_)
-    for k, goal in enumerate(goals):
-        if goal.need.before is not None:
-            keep &= (met >> k & 1 == 1) | known.at(goal.need.before, poses, SATISFIED_ABOVE)
-    return keep
-
-
-def _key(poses: Floats, met: Ints, run: Ints) -> Ints:
-    """One number for each place, with what is met there."""
+def _key(poses: Floats) -> Ints:
+    """One number for each place."""
     cells = np.floor(poses[:, :2] / CELL).astype(np.int64) & 0xFFFF
     heading = np.round(poses[:, 2] * HEADINGS / (2.0 * math.pi)).astype(np.int64) % HEADINGS
-    key = ((cells[:, 0] << 16 | cells[:, 1]) * HEADINGS + heading) << 8 | met
-    for column in run.T:
-        key = key * 1031 + column
-    return key
-
-
-def _best(
-    goals: Sequence[Wanted], ground: Ground, poses: Floats, met: Ints, run: Ints, step: int, width: int
-) -> Ints:
-    """The poses to go on from: for each set of goals that are met, those with the most steps to spare."""
-    at = ground.squares(poses)
-    spare, hopeless = np.full(len(poses), np.inf), np.zeros(len(poses), np.bool_)
-    for k, goal in enumerate(goals):
-        ahead = ground.steps(goal.far[at])
-        ahead = np.where(run[:, k] > 0, 1 - run[:, k], ahead)  # a goal that is being met was begun in time
-        is_open = met >> k & 1 == 0
-        hopeless |= is_open & (step + ahead > goal.due)
-        spare = np.where(is_open, np.minimum(spare, goal.due - step - ahead), spare)
-    order = np.argsort(-spare, kind="stable")
-    order = order[~hopeless[order]]
-    chosen = []
-    for one in np.unique(met[order]):
-        same = order[met[order] == one]
-        chosen.append(same[spare[same] >= spare[same[0]] - BEHIND][:width])
-    return np.concatenate(chosen) if chosen else np.empty(0, np.int64)
+    return (cells[:, 0] << 16 | cells[:, 1]) * HEADINGS + heading
