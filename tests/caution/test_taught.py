@@ -258,6 +258,18 @@ def test_points_under_the_robot_are_ignored_and_said():
     assert decision.warnings == ("`occupied` points under the robot were ignored: it stands there",)
 
 
+@pytest.mark.parametrize(("gone", "seen_at", "passed"), [(1.2, 0.4, False), (0.2, 0.2, True)])
+def test_what_lies_half_way_of_a_jump_of_the_pose_was_not_passed(gone, seen_at, passed):
+    """A robot that is carried, or whose localisation jumps, has not driven through what was seen between."""
+    shield, (x, y, _) = shield_of(learn_map=True), START
+    box = [(x + seen_at + dx, y + dy) for dx in (0.0, 0.05) for dy in (-0.05, 0.0, 0.05)]
+    first = decide(shield, [START], None, main_task_done=True, occupied=box)
+    there = (x + gone, y, 0.0)
+    second = decide(shield, [START, there], None, main_task_done=True, carry=first.carry)
+    left = Taught.from_bytes(second.carry.learned).map.cell
+    assert (len(left) < len(Taught.from_bytes(first.carry.learned).map.cell)) is passed
+
+
 def test_points_outside_the_map_are_ignored_and_said():
     decision = decide(shield_of(30), [START], None, True, occupied=[(50.0, 1.0)])
     assert decision.map_revision == 0

@@ -183,11 +183,14 @@ def teach(
 @leaf
 def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tuple[bool, bool]:
     """Whether the footprint overlaps obstacles by more than UNDER half way between two poses (3,), and at the
-    second. Writes the pose half way, before the motion's turn, into half_way (3,).
+    second. Writes the pose half way, before the motion's turn, into half_way (3,). If no motion leads as far,
+    the robot was carried, or only its localisation moved: nothing is known of the way between.
     """
     half_way[0], half_way[1] = 0.5 * (before[0] + after[0]), 0.5 * (before[1] + after[1])
     half_way[2] = before[2]
-    half = overlap(body, half_way[0], half_way[1], half_way[2]) > UNDER
+    far, _ = longest_motions(body)
+    half = math.hypot(after[0] - before[0], after[1] - before[1]) <= far + NEAR[0]
+    half = half and overlap(body, half_way[0], half_way[1], half_way[2]) > UNDER
     return half, overlap(body, after[0], after[1], after[2]) > UNDER
 
 
