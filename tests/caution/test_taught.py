@@ -32,6 +32,7 @@ from specshield.task import make_task
 from specshield.world.learned import CONTACT, SENT, LearnedMap, applied, learn, revised
 from specshield.world.occupancy import OccupancyGrid
 from tests.made import synthesise
+from tests.oracles.cells import FORWARD, LEFT, Cells, Scripted
 
 GOAL = {"type": "circle", "center": [3.5, 1.0], "radius": 0.4}
 START = (0.6, 1.0, 0.0)
@@ -638,6 +639,24 @@ def test_what_can_still_be_kept_is_kept_while_another_part_is_lost_but_not_yet_b
         poses.append((8.6, 0.5, math.pi) if t == 4 else moved)
     assert max(0.4 - math.hypot(x - 3.0, y - 0.5) for x, y, _ in poses[20:37]) > 0.0
     assert said == []
+
+
+def test_what_a_way_out_keeps_is_kept_though_no_policy_finds_that_way_again():
+    """A is too far for its window; for B there is time, but after the first step the policy stands still."""
+    cells = Cells("F[0,1] A and F[0,7] B", None, {"A": (4, 4), "B": (2, 0)})
+    to_b = {LEFT: [LEFT, FORWARD, FORWARD]}
+    policy = Scripted(cells, lambda t, motion: to_b.get(motion, []) if t == 0 else [])
+    shield, poses, carry = (
+        make_shield([policy], Config(uncertainty=Uncertainty())),
+        [cells.pose(0, 0, 2)],
+        None,
+    )
+    for t in range(4):
+        decision = decide(shield, poses, None, True, carry=carry)
+        assert (decision.witness is None) is (t == 0)  # until A is lost, nothing is certified
+        carry = decision.carry
+        poses.append(step(shield.body, *poses[-1], int(cells.task.robot.motion_of[decision.action])))
+    assert cells.state(poses[-1])[:2] == (2, 0)
 
 
 def test_where_no_part_can_be_kept_alone_no_ways_are_asked_for_that_keep_two(monkeypatch):

@@ -18,7 +18,8 @@ from specshield.shield.decision import Shield
 class Findings(NamedTuple):
     """shield, taught: on the map that is believed, and what the session has learned if that is so. now: what
     the actions were judged by. doubts [M]: motions that had better not be drawn. withstands: whether the
-    whole rule is kept whatever the signals do. said: warnings.
+    whole rule is kept whatever the signals do. onward [M]: if no motion is feasible, the rest of the future
+    that is begun, which nothing certifies. said: warnings.
     """
 
     shield: Shield
@@ -27,6 +28,7 @@ class Findings(NamedTuple):
     judged: Judged
     doubts: Bools
     withstands: bool
+    onward: tuple[bytes | None, ...] | None
     said: tuple[str, ...]
 
 
@@ -47,4 +49,7 @@ def findings(told: Shield, shield: Shield, taught: Taught, now: Situation, nexts
     judged = without(judged, shield, doubts, risky)
     if judged.vain and judged.some:
         said.append("every way left has a motion that led nowhere from here before: it is tried again")
-    return Findings(shield, taught, now, judged, doubts, withstands, tuple(said))
+    way, onward = judged.begun, None
+    if way is not None:
+        onward = tuple(way[1:] if motion == way[0] else None for motion in range(len(nexts)))
+    return Findings(shield, taught, now, judged, doubts, withstands, onward, tuple(said))

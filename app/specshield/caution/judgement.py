@@ -56,6 +56,7 @@ class Judged(NamedTuple):
     completion: int  # the action to execute if the model's task is over
     vain: bool  # whether every future that keeps the rule makes a motion that led nowhere before
     left_out: Bools  # [M]: motions that are set aside since only such futures of theirs keep the rule
+    begun: bytes | None = None  # the future that keeps most, one motion a byte, if none keeps the rule
 
     @property
     def some(self) -> bool:

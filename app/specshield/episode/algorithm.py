@@ -148,10 +148,10 @@ def decide(
         if found.shield.body is not shield.body:  # another map is believed
             touches = _look_around(found.shield.body, poses[-1], nexts)
         shield, taught, prefix, judged = found.shield, found.taught, found.now.prefix, found.judged
-        doubts, withstands, said = found.doubts, found.withstands, (*said, *found.said)
+        doubts, withstands, onward = found.doubts, found.withstands, found.onward
         body = shield.body if len(taught.map) else told.body  # if nothing was learned, the map is as told
         certified = certify(shield, body, judged.part if spec_status == "violated" else whole, judged.claim)
-        said = (*said, *certified.warnings)
+        said = (*said, *found.said, *certified.warnings)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             memory, weights = _preferred(shield, memory, poses, signals, log_prior, certified.feasible)
             if weights is None:

@@ -134,12 +134,12 @@ class Carry(NamedTuple):
     """What one decision hands to the next.
 
     next_poses [M, 3]: where f leads by each motion. witnesses: for each motion the T - t - 1 motions that
-    follow it, one a byte; None if it is not certified, nor has a chance by a threshold over the episode.
-    memory: of the session's preference. residuals: what the session has seen of its robot (`Seen` in
-    caution/experience.py). threshold_left: what is left of a threshold over the episode. learned: what the
-    session has learned of its map (`Taught.to_bytes`). action: the one that was drawn, which the caller may
-    have executed. way: where a rule begins to hold, and a search found a way but no policy did, the motions
-    of that way to the horizon, one a byte. stuck, here: see `Taught`.
+    follow it, one a byte; None if it is neither certified, nor begun while none is, nor has a chance by a
+    threshold over the episode. memory: of the session's preference. residuals: what the session has seen of
+    its robot (`Seen` in caution/experience.py). threshold_left: what is left of a threshold over the episode.
+    learned: what the session has learned of its map (`Taught.to_bytes`). action: the one that was drawn,
+    which the caller may have executed. way: where a rule begins to hold, and a search found a way but no
+    policy did, the motions of that way to the horizon, one a byte. stuck, here: see `Taught`.
     """
 
     t: int

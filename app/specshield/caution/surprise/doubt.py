@@ -111,29 +111,30 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     if judged.some or not recovers(shield.config):
         return judged
     tried = judged.tried
-    first, lost, said, (nearer, better) = most_kept(shield, judged.part, tried.motions)
+    way, lost, said, (nearer, better) = most_kept(shield, judged.part, tried.motions)
     parts, able = lost, [each for each in shield.proposers if hasattr(each, "giving_up")]
     for alone in (True, False) if able and len(parts) > 1 else ():  # keep one part alone, then all but one
         few = [tuple(each for each in parts if (each == one) != alone) for one in parts[:MOST_PARTS]]
         asked = [adapted(each, "giving_up", some) for some in few for each in able]
         tried = together(tried, futures(now.prefix, shield.body, asked, None, (0.0,)))
-        first, lost, said, (nearer, better) = most_kept(shield, judged.part, tried.motions)
+        way, lost, said, (nearer, better) = most_kept(shield, judged.part, tried.motions)
         if len(parts) == 2 or lost == parts:  # if no part can be kept alone, no two can
             break
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and _loses(shield, judged.part, tried, awaited) == lost:
-        first, said = awaited, ("something is in every way that is left: it is waited for",)
+        way, said = np.array([awaited]), ("something is in every way that is left: it is waited for",)
     elif not nearer:
         known, marked, ways = taught.map, taught.map.occupied & (taught.map.by != SENT), judged.tried
         if marked.any() or len(taught.barred):  # contacts may be the reason
             free = on_map(told, revised(known, forget(known, marked)))
             asked = [adapted(each, "briefly") for each in free.proposers]
             ways = futures(now.prefix, free.body, asked, None, (0.0,))
-            first, _, said, (_, better) = most_kept(free, judged.part, ways.motions)
+            way, _, said, (_, better) = most_kept(free, judged.part, ways.motions)
             said = ("what contacts taught leaves no way, so it is ignored for this action", *said)
-        first = first if better else ways.preferred
+        way = way if better else np.array([ways.preferred])
     tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # only the futures that were judged
-    return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
+    completion = int(shield.task.robot.representative[way[0]])
+    return judged._replace(tried=tried, completion=completion, begun=way.astype(np.uint8).tobytes())
 
 
 def _loses(shield: Shield, prefix: Prefix, tried: Futures, first: int) -> tuple[Formula, ...]:

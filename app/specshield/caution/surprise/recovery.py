@@ -4,6 +4,9 @@ After a surprise, or once a part of the rule is lost, the other parts are kept: 
 those of the form G, then those that end soonest. Among futures that keep the same parts, the one is chosen
 that comes nearest to the first part given up, since a way to keep that part may still be found later. Only
 the steps to come count for that: a robot that has just backed out of something was nearer before.
+
+A future that was begun is tried again at the next step, so what it keeps is not lost because it is not found
+anew.
 """
 
 from __future__ import annotations
@@ -28,8 +31,8 @@ def recovers(config: Config) -> bool:
 
 def most_kept(
     shield: Shield, prefix: Prefix, futures: Ints
-) -> tuple[int, tuple[Formula, ...], tuple[str, ...], tuple[bool, bool]]:
-    """The first motion of the future that keeps most of `prefix.formula`; the parts that it gives up, the
+) -> tuple[Ints, tuple[Formula, ...], tuple[str, ...], tuple[bool, bool]]:
+    """The future that keeps most of `prefix.formula`, its motions [T - t]; the parts that it gives up, the
     safest first; a sentence for each of these; and whether the future comes nearer to keeping the first of
     them than the robot ever was, and than standing for ever.
 
@@ -57,7 +60,7 @@ def most_kept(
     ever, nearest = (np.where(left, each, -np.inf) for each in (ever, nearest))
     best = int(np.argmax(nearest[:-1]))
     better = bool(ever[best] > ever[-1] + BETTER), bool(nearest[best] > nearest[-1] + BETTER)
-    return int(futures[best, 0]), tuple(lost), tuple(said), better
+    return futures[best], tuple(lost), tuple(said), better
 
 
 def given_up(prefix: Prefix, asked: Formula) -> tuple[str, ...]:
