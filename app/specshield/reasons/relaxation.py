@@ -27,7 +27,7 @@ from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 from specshield.stl.conjunction import is_predicate
 
 MOST_LATE = 150  # [steps] the most by which a window is tried to end later. Chosen by hand
-MOST_SEARCHES = 48  # for later ends of windows, in one refusal; each takes 0.3 s at most. Chosen by hand
+MOST_PROBED, PROBE = 100_000, 20_000  # poses in searches for later ends: in all, and in one. By hand
 MOST_CONJUNCTS = 8  # that are searched for; further ones are judged by the policies' futures alone
 
 
@@ -132,14 +132,15 @@ class _Searched:
     shield: Shield
     known: Known
     ground: Ground
-    left: int = MOST_SEARCHES  # for later ends of windows
+    probes: int = MOST_PROBED  # poses that may still be looked at for later ends of windows
+    looked_at: int = 0  # by the last search
 
     def way(self, formula: Formula, most: int = MOST_NODES) -> Ints | None:
         """Motions from x_t to the formula's horizon that satisfy it, if a search finds some. most: poses that
         it looks at.
         """
         task = replace(self.shield.task, formula=formula)
-        found = search(replace(self.known, task=task), self.ground, self.shield.body, most)
+        found, self.looked_at = search(replace(self.known, task=task), self.ground, self.shield.body, most)
         if found is None:
             return None
         poses = driven(self.shield, self.known.history, found[None])
@@ -152,8 +153,9 @@ class _Searched:
         """
 
         def found(late: int) -> Ints | None:
-            self.left -= 1
-            return self.way(_eased(parts, i, late), MOST_NODES // 3) if self.left >= 0 else None
+            way = self.way(_eased(parts, i, late), min(self.probes, PROBE)) if self.probes > 0 else None
+            self.probes -= self.looked_at
+            return way
 
         most, low, high, best = _most_late(parts[i]), 0, 1, None
         while best is None and low < most:

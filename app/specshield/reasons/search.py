@@ -29,10 +29,10 @@ from specshield.stl import SATISFIED_ABOVE, Formula
 from specshield.stl.conjunction import is_predicate
 from specshield.stl.formula import Node
 
-# Chosen by hand: a search takes a second at most.
-MOST_NODES = 60_000
+# Chosen by hand: a search takes two seconds at most.
+MOST_NODES = 40_000
 MOST_LEFT = 4_000  # different formulas that are left
-MOST_PREDICATES = 62  # their truths at a pose are the bits of one number
+MOST_PREDICATES = 40  # their truths at a pose are the lower bits of a number
 WIDTH = 120  # poses that one step goes on from, for each formula that is left
 MOST_MOTIONS = 1_500  # made from all of these poses
 BEHIND = 8.0  # [steps] such a pose may have fewer to spare than the best one: what it takes to turn round
@@ -128,9 +128,10 @@ class _Lefts:
 
     def after(self, left: Ints, truths: Ints, step: int) -> Ints:
         """What is left of each [n] after a step with these truths [n]."""
-        pairs, which = np.unique(np.column_stack([left, truths]), axis=0, return_inverse=True)
-        found = [self._after(int(one), int(bits), step) for one, bits in pairs]
-        return np.array(found, np.int64)[which.reshape(-1)]
+        both, which = np.unique(left << len(self.predicates) | truths, return_inverse=True)
+        bits = len(self.predicates)
+        found = [self._after(each >> bits, each & ~(-1 << bits), step) for each in both.tolist()]
+        return np.array(found, np.int64)[which]
 
     def kept_by_waiting(self, left: int, truths: int, step: int) -> bool:
         """Whether the formula is kept if the predicates hold for ever as they do at this step."""
@@ -184,15 +185,15 @@ class _Lefts:
         return best
 
 
-def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> Ints | None:
-    """Motions from x_t to the horizon that satisfy the task's formula; None where none were found. most: how
-    many poses are looked at.
+def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> tuple[Ints | None, int]:
+    """Motions from x_t to the horizon that satisfy the task's formula, None where none were found; and how
+    many poses were gone on from, at most about `most`.
     """
     wait, now, tree, until = calmest_motion(body), known.now, _Tree(), known.task.horizon
     waits, count = known.task.robot.wait_motion >= 0, motion_count(body)
     lefts = _Lefts(known, ground, tuple(dict.fromkeys(_predicates(positive(known.task.formula)))))
     if len(lefts.predicates) > MOST_PREDICATES:
-        return None
+        return None, 0
     here = known.history[-1:]
     nodes = tree.add(now, np.array([-1]), np.array([-1]))
     last = Place(nodes, here, np.array([lefts.begun()]), lefts.truths(here))
@@ -201,7 +202,7 @@ def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> 
         done = _done(lefts, last, step - 1, waits)
         if done is not None:
             way = tree.way(done, wait)
-            return np.array(way + [wait] * (until - now - len(way)), np.int64)
+            return np.array(way + [wait] * (until - now - len(way)), np.int64), tree.size
         poses = spread(body, last.poses)
         truths = lefts.truths(poses)
         left = lefts.after(np.repeat(last.left, count), truths, step)
@@ -219,11 +220,11 @@ def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> 
         else:
             last = moved
         if not len(last.node) and not (waits and len(pool.node)):
-            return None
+            return None, tree.size
         if tree.size > most or len(lefts.all) > MOST_LEFT:
-            return None
+            return None, tree.size
     done = _done(lefts, last, until, waits)
-    return None if done is None else np.array(tree.way(done, wait), np.int64)
+    return None if done is None else np.array(tree.way(done, wait), np.int64), tree.size
 
 
 def _predicates(formula: Node) -> Iterator[Formula]:
@@ -236,8 +237,10 @@ def _predicates(formula: Node) -> Iterator[Formula]:
 
 def _done(lefts: _Lefts, last: Place, step: int, waits: bool) -> int | None:
     """The node from which the formula is kept by waiting, or by whatever a robot does that cannot wait."""
-    pairs, first = np.unique(np.column_stack([last.left, last.truths]), axis=0, return_index=True)
-    for (left, truths), at in zip(pairs.tolist(), first.tolist(), strict=True):
+    bits = len(lefts.predicates)
+    both, first = np.unique(last.left << bits | last.truths, return_index=True)
+    for each, at in zip(both.tolist(), first.tolist(), strict=True):
+        left, truths = each >> bits, each & ~(-1 << bits)
         if left == DONE or (waits and lefts.kept_by_waiting(left, truths, step)):
             return int(last.node[at])
     return None
