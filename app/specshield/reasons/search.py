@@ -40,7 +40,6 @@ CELL, HEADINGS = 0.05, 120  # poses in one cell [m] and one of so many headings 
 MOST_WAYS, MOST_GOALS = 4, 8  # alternatives of one formula, and goals of one alternative, that are looked at
 LOST, DONE = 0, 1  # the numbers of False and True among the formulas that are left
 
-
 Seen = set[tuple[int, int]]  # places that the search went on from, with what was left there
 
 
@@ -115,15 +114,9 @@ class _Lefts:
         past = [self.known.past(each) for each in self.predicates]
         left: Left = True
         for step in range(self.known.now + 1):
-            holds = {
-                each: bool(there[min(step, len(there) - 1)])
-                for each, there in zip(self.predicates, past, strict=True)
-            }
-            left = (
-                after(left, step, holds.__getitem__)
-                if step
-                else begun(self.known.task.formula, holds.__getitem__)
-            )
+            true = (bool(each[min(step, len(each) - 1)]) for each in past)
+            holds = dict(zip(self.predicates, true, strict=True)).__getitem__
+            left = after(left, step, holds) if step > 0 else begun(self.known.task.formula, holds)
         return self.numbered(left)
 
     def after(self, left: Ints, truths: Ints, step: int) -> Ints:
@@ -198,11 +191,13 @@ def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> 
     nodes = tree.add(now, np.array([-1]), np.array([-1]))
     last = Place(nodes, here, np.array([lefts.begun()]), lefts.truths(here))
     pool, seen = last, Seen()
-    for step in range(now + 1, until + 1):
+    for step in range(now + 1, max(until, now) + 2):
         done = _done(lefts, last, step - 1, waits)
         if done is not None:
             way = tree.way(done, wait)
             return np.array(way + [wait] * (until - now - len(way)), np.int64), tree.size
+        if step > until:
+            break
         poses = spread(body, last.poses)
         truths = lefts.truths(poses)
         left = lefts.after(np.repeat(last.left, count), truths, step)
@@ -219,12 +214,10 @@ def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> 
             pool = pool.of(left != LOST).and_(moved)
         else:
             last = moved
-        if not len(last.node) and not (waits and len(pool.node)):
-            return None, tree.size
-        if tree.size > most or len(lefts.all) > MOST_LEFT:
-            return None, tree.size
-    done = _done(lefts, last, until, waits)
-    return None if done is None else np.array(tree.way(done, wait), np.int64), tree.size
+        ended = not len(last.node) and not (waits and len(pool.node))
+        if ended or tree.size > most or len(lefts.all) > MOST_LEFT:
+            break
+    return None, tree.size
 
 
 def _predicates(formula: Node) -> Iterator[Formula]:
@@ -256,7 +249,6 @@ def _new(lefts: _Lefts, place: Place, step: int, seen: Seen) -> Ints:
         others = here.get(key, {})
         if left == LOST or (key, left) in seen or lefts.asks_more(left, others):
             continue
-        others = here.get(key, {})
         here[key] = {other: at for other, at in others.items() if not lefts.asks_more(other, (left,))}
         here[key][left] = row
     rows = np.sort(np.array([row for found in here.values() for row in found.values()], np.int64))
