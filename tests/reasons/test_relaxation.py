@@ -279,3 +279,20 @@ def test_a_heading_that_can_be_had_is_feasible_alone():
     waiting = make_shield([Scripted(SimpleNamespace(task=task), waits)])
     told = relaxations(waiting, np.array([[1.0, 1.0, 0.0]]), {}).conjuncts
     assert [each.feasible_alone for each in told] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("rule", "alone", "late"),
+    [
+        ("not (A U[0,4] (F[0,2] D)) and F[0,1] C", [True, False], 9),
+        ("G[0,60] (F[20,40] B and F[20,40] A) and F[0,5] C", [False, False], 5),
+    ],
+)
+def test_a_rule_of_which_much_or_a_negation_is_left_is_refused_with_its_parts(rule, alone, late):
+    """C is ten motions away. Without a bound on the work for what is left of it, the search for the second
+    rule took more than 20 s.
+    """
+    cells = Cells(rule, None, PLACES)
+    told = relaxations(make_shield([Scripted(cells, waits)]), np.array([cells.pose(0, 0, 2)]), {})
+    assert [each.feasible_alone for each in told.conjuncts] == alone
+    assert told.conjuncts[1].late_by == late

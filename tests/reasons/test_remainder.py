@@ -4,7 +4,9 @@ from functools import partial
 
 import numpy as np
 
+from specshield.reasons.needs import positive
 from specshield.reasons.remainder import after, begun, implies
+from specshield.reasons.search import _predicates
 from specshield.stl import Formula, parse
 from tests.reasons.random_rules import HORIZON, PLACES, draw
 
@@ -20,13 +22,18 @@ def test_what_is_left_after_every_step_is_whether_the_rule_is_kept():
         rule = draw(random, depth=3)
         inside = {name: random.random(HORIZON + 1) < 0.5 for name in PLACES}
         kept = bool(rule.at(inside, 0))
-        formula, left = parse(rule.text), None
+        formula, left, asked = parse(rule.text), None, set()
         for step in range(HORIZON + 1):
-            held = partial(holds, inside=inside, step=step)
+
+            def held(predicate, inside=inside, step=step, asked=asked):
+                asked.add(predicate)
+                return holds(predicate, inside, step)
+
             left = after(left, step, held) if step else begun(formula, held)
             if isinstance(left, bool):
                 assert left is kept, rule.text
         assert left is kept, rule.text
+        assert asked <= set(_predicates(positive(formula))), rule.text  # a search has no others
         seen.add((kept, formula.horizon))
     assert len(seen) >= 10
 

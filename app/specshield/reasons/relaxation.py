@@ -153,7 +153,9 @@ class _Searched:
         """
 
         def found(late: int) -> Ints | None:
-            way = self.way(_eased(parts, i, late), min(self.probes, PROBE)) if self.probes > 0 else None
+            if self.probes <= 0:
+                return None
+            way = self.way(_eased(parts, i, late), min(self.probes, PROBE))
             self.probes -= self.looked_at
             return way
 

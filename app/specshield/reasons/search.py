@@ -25,13 +25,14 @@ from specshield.reasons.known import Known
 from specshield.reasons.needs import Reader, positive
 from specshield.reasons.remainder import Left, after, begun, implies, next_change
 from specshield.robot.dynamics import Body, calmest_motion, motion_count
-from specshield.stl import SATISFIED_ABOVE, Formula
+from specshield.stl import SATISFIED_ABOVE, And, Formula, Not, Or
 from specshield.stl.conjunction import is_predicate
 from specshield.stl.formula import Node
 
 # Chosen by hand: a search takes two seconds at most.
 MOST_NODES = 40_000
 MOST_LEFT = 4_000  # different formulas that are left
+MOST_WORK = 1_000_000  # pairs of parts of such formulas that are compared, about
 MOST_PREDICATES = 40  # their truths at a pose are the lower bits of a number
 WIDTH = 120  # poses that one step goes on from, for each formula that is left
 MOST_MOTIONS = 1_500  # made from all of these poses
@@ -39,6 +40,11 @@ BEHIND = 8.0  # [steps] such a pose may have fewer to spare than the best one: w
 CELL, HEADINGS = 0.05, 120  # poses in one cell [m] and one of so many headings are one place
 MOST_WAYS, MOST_GOALS = 4, 8  # alternatives of one formula, and goals of one alternative, that are looked at
 LOST, DONE = 0, 1  # the numbers of False and True among the formulas that are left
+
+
+class _TooMuchError(Exception):
+    """The formulas that are left take too much work."""
+
 
 Seen = set[tuple[int, int]]  # places that the search went on from, with what was left there
 
@@ -96,6 +102,13 @@ class _Lefts:
     next: dict[tuple[int, int, int], int] = field(default_factory=dict)
     implied: dict[tuple[int, int], bool] = field(default_factory=dict)
     goals: dict[int, tuple[int, tuple[tuple[Goal, ...], ...]]] = field(default_factory=dict)
+    work: int = 0
+
+    def count(self, work: int) -> None:
+        """Raises _TooMuchError once all work together is more than MOST_WORK."""
+        self.work += work
+        if self.work > MOST_WORK:
+            raise _TooMuchError
 
     def numbered(self, left: Left) -> int:
         if left not in self.number:
@@ -116,6 +129,7 @@ class _Lefts:
         for step in range(self.known.now + 1):
             true = (bool(each[min(step, len(each) - 1)]) for each in past)
             holds = dict(zip(self.predicates, true, strict=True)).__getitem__
+            self.count(_parts(left) ** 2)
             left = after(left, step, holds) if step > 0 else begun(self.known.task.formula, holds)
         return self.numbered(left)
 
@@ -138,6 +152,7 @@ class _Lefts:
     def _after(self, left: int, truths: int, step: int) -> int:
         key = left, truths, step
         if key not in self.next:
+            self.count(_parts(self.all[left]) ** 2 + 50)
             index = {each: k for k, each in enumerate(self.predicates)}
             found = after(self.all[left], step, lambda each: bool(truths >> index[each] & 1))
             self.next[key] = self.numbered(found)
@@ -148,6 +163,7 @@ class _Lefts:
         for other in others:
             key = left, other
             if key not in self.implied:
+                self.count(_parts(self.all[left]) * _parts(self.all[other]) + 1)
                 self.implied[key] = implies(self.all[left], self.all[other])
             if self.implied[key]:
                 return True
@@ -178,10 +194,22 @@ class _Lefts:
         return best
 
 
+def _parts(left: Left) -> int:
+    return len(left.children) if isinstance(left, And | Or) else 1
+
+
 def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> tuple[Ints | None, int]:
     """Motions from x_t to the horizon that satisfy the task's formula, None where none were found; and how
-    many poses were gone on from, at most about `most`.
+    many poses were gone on from, at most about `most`. A search that gives up on the formulas counts as one
+    that looked at so many.
     """
+    try:
+        return _search(known, ground, body, most)
+    except _TooMuchError:
+        return None, most
+
+
+def _search(known: Known, ground: Ground, body: Body, most: int) -> tuple[Ints | None, int]:
     wait, now, tree, until = calmest_motion(body), known.now, _Tree(), known.task.horizon
     waits, count = known.task.robot.wait_motion >= 0, motion_count(body)
     lefts = _Lefts(known, ground, tuple(dict.fromkeys(_predicates(positive(known.task.formula)))))
@@ -221,9 +249,13 @@ def search(known: Known, ground: Ground, body: Body, most: int = MOST_NODES) -> 
 
 
 def _predicates(formula: Node) -> Iterator[Formula]:
+    """Every predicate that what is left of the formula may ask for."""
     if is_predicate(formula) and isinstance(formula, Formula):
         yield formula
         return
+    if isinstance(formula, Not):  # of an `until`: what is left of its parts is negated
+        for part in formula.child.parts:
+            yield from _predicates(positive(part, True)) if isinstance(part, Formula) else ()
     for part in formula.parts:
         yield from _predicates(part)
 

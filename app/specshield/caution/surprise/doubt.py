@@ -21,7 +21,7 @@ from specshield.stl import Formula
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
-BESIDE = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
+BESIDE_WALLS = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
 AGAIN = 0.2  # [m] from what was touched before; what is nearer may be the same thing. Chosen by hand
 SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
@@ -63,11 +63,12 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     is gone; then cells that no sensor saw again for UNSEEN_AFTER steps. At last, all just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
-    marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE
+    marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE_WALLS
     held = [marked & np.isin(known.by, some) for some in GUESSES]
     held.insert(1, marked & beside & (known.by != BEHIND))
     newest = marked & (known.step == known.step[marked].max(initial=-1))
-    same = newest & (known.by != BEHIND) & _is_near(told, known.cell, known.cell[marked & ~newest])
+    same, front = np.zeros_like(newest), np.flatnonzero(newest & (known.by != BEHIND))
+    same[front] = _is_near(told, known.cell[front], known.cell[marked & ~newest])
     if same.any():
         held.insert(1, (marked & ~newest) | same)
     first = max(taught.followed.met - 1, 0) % len(held)

@@ -31,8 +31,8 @@ class Begun:
 
 def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
     """If the robot stands where it stood, though the action that was drawn last leads elsewhere: the shield
-    with one more proposer, of that action's certified way. Otherwise, or if motions are taken to be exact,
-    the same shield. poses [t + 1, 3].
+    with one more proposer, of the future that was begun with that action. Otherwise, or if motions are taken
+    to be exact, the same shield. poses [t + 1, 3].
     """
     task, uncertain = shield.task, shield.config.uncertainty is not None
     if not uncertain or carry is None or carry.t != len(poses) - 2 or carry.action is None:

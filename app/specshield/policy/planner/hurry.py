@@ -12,28 +12,34 @@ from specshield.task import Task
 
 def hurried(task: Task, formula: Formula, early: int, poses: Floats, rows: Floats) -> Formula:
     """What x_{0:t} leaves open of the formula, with deadlines that come `early` steps earlier: the ends of F
-    and U, whose windows keep at least half of their length, and the begin of each G to come that does not
-    hold at x_t. The formula itself follows from this, since only negations are left as they are.
+    and U that can still be met so early, whose windows keep at least half of their length, and the begin of
+    each G to come that does not hold at x_t. The formula itself follows from this, since only negations are
+    left as they are.
 
     poses [t + 1, 3], rows [t + 1, S]: the signals.
     """
     t = len(poses) - 1
 
-    def sooner(part: Formula) -> Formula:
+    def end(a: int, b: int, from_0: bool) -> int:
+        last = b - min(early, (b - a) // 2)
+        return b if from_0 and last <= t else last
+
+    def sooner(part: Formula, from_0: bool = True) -> Formula:
+        """from_0: whether the part's window counts from step 0, and not from a step of another window."""
         match part:
             case Eventually(a, b, child):
-                return Eventually(a, b - min(early, (b - a) // 2), sooner(child))
+                return Eventually(a, end(a, b, from_0), sooner(child, False))
             case Until(a, b, left, right):
-                return Until(a, b - min(early, (b - a) // 2), left, sooner(right))
-            case Always(a, b, child) if a > t + 1 and child.horizon == 0:
+                return Until(a, end(a, b, from_0), left, sooner(right, False))
+            case Always(a, b, child) if from_0 and a > t + 1 and child.horizon == 0:
                 holds = bounds_after(task, Always(t, t, child), poses, rows)[0] > SATISFIED_ABOVE
                 return part if holds else Always(max(a - early, t + 1), b, child)
             case Always(a, b, child):
-                return Always(a, b, sooner(child))
+                return Always(a, b, sooner(child, False))
             case And(children) | Or(children):
-                return replace(part, children=tuple(map(sooner, children)))
+                return replace(part, children=tuple(sooner(child, from_0) for child in children))
             case Implies(left, right):
-                return Implies(left, sooner(right))
+                return Implies(left, sooner(right, from_0))
             case _:
                 return part
 

@@ -142,10 +142,9 @@ class Bodies:
             if upload:
                 scope["state"]["body"] = body
                 await self.app(scope, receive, send)
-            elif body.size > FREE and path.endswith(("/close", "/switch")):  # steps.py does so for steps
-                steps = scope["app"].state.server.sessions.steps
-                replay = _replay(body.content, receive)
-                await steps.giving_way(scope["state"]["owner"], self.app, scope, replay, send)
+            elif body.size > FREE and path.endswith(("/close", "/switch")):
+                turns, owner = scope["app"].state.server.sessions.steps.rare, scope["state"]["owner"]
+                await turns.having(owner, self.app, scope, _replay(body.content, receive), send)
             else:
                 await self.app(scope, _replay(body.content, receive), send)
         finally:

@@ -20,6 +20,7 @@ from functools import cached_property
 from typing import Any
 
 from rq import Queue
+from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from specshield.errors import StoreError
@@ -91,6 +92,7 @@ class Jobs:
                 return
             self.sign_of_life(id, attempt)  # for the moment in which the queue does not have it
             if self.redis.lrem(queue.key, 1, attempt):  # else a worker has taken it
+                self.redis.delete(Job.key_for(attempt))
                 again = own + secrets.token_hex(8)
                 if self.report(id, attempt, attempt=again):  # else it was cancelled
                     self._enqueue(id, again, method)
