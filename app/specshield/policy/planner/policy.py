@@ -33,9 +33,9 @@ from specshield.policy.lattice import headings_of, side_of
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import cost_of
+from specshield.policy.planner.earlier import earlier_rule
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields
 from specshield.policy.planner.first_motions import plan_all
-from specshield.policy.planner.hurry import hurried
 from specshield.policy.planner.leads import MAX_ENTRIES, MAX_FIELDS, make_fields
 from specshield.policy.planner.literals import leading, literals_of, released
 from specshield.policy.planner.method import Settings
@@ -178,7 +178,7 @@ class PlannerPolicy(Carded):
         for part in chain.from_iterable(dict.fromkeys((released(each), each)) for each in parts):
             asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
             if self.early:
-                asked = tuple(hurried(self.task, each, self.early, history, rows) for each in asked)
+                asked = tuple(earlier_rule(self.task, each, self.early, history, rows) for each in asked)
             worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
             plans = [self._plan_in(world, history, rows, margin, most) for world in worlds]
             found = any(found for _, found in plans)

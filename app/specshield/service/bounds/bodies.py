@@ -143,7 +143,7 @@ class Bodies:
                 scope["state"]["body"] = body
                 await self.app(scope, receive, send)
             elif body.size > FREE and path.endswith(("/close", "/switch")):
-                turns, owner = scope["app"].state.server.sessions.steps.rare, scope["state"]["owner"]
+                turns, owner = scope["app"].state.server.sessions.steps.long_requests, scope["state"]["owner"]
                 await turns.having(owner, self.app, scope, _replay(body.content, receive), send)
             else:
                 await self.app(scope, _replay(body.content, receive), send)

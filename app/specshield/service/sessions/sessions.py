@@ -95,11 +95,8 @@ class Sessions:
             preference = await self._shields.prepared(self._run, *about)
         found = await self._run(lambda: [self._policies.find(id, key.name) for id in request.policies])
         if (last := found[0].horizon) > (most := self._settings.max_steps):
-            told, expected = (
-                "the rule ends after the last step that a session can have",
-                f"at most step {most}",
-            )
-            raise InputError(told, path="policy_id", got=f"step {last}", expected=expected)
+            told = "the rule ends after the last step that a session can have"
+            raise InputError(told, path="policy_id", got=f"step {last}", expected=f"at most step {most}")
         ids = [record.id for record in found]
         asked = request, settings, preference, key.name
         try:  # in another process where the policies' decisions take long, else in a thread

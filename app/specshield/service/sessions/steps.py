@@ -102,7 +102,7 @@ class Steps:
         self._heavy, self._tell = heavy, tell
         self.deciding = 0  # steps that are being decided
         self._turns = Turns(1, WAITING)
-        self.rare = Turns(1, WAITING)  # of requests with a long history that are no steps, and may last long
+        self.long_requests = Turns(1, WAITING)  # with a long history that are no steps, and may last long
         # A kept session may be out of date, since other processes write too: the append then finds that out.
         self.recent = files.Recent[Session](ROOM, attrgetter("size"))
         self._paces = files.Recent[Pace](1000)

@@ -10,7 +10,7 @@ from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, Im
 from specshield.task import Task
 
 
-def hurried(task: Task, formula: Formula, early: int, poses: Floats, rows: Floats) -> Formula:
+def earlier_rule(task: Task, formula: Formula, early: int, poses: Floats, rows: Floats) -> Formula:
     """What x_{0:t} leaves open of the formula, with deadlines that come `early` steps earlier: the ends of F
     and U that can still be met so early, whose windows keep at least half of their length, and the begin of
     each G to come that does not hold at x_t. The formula itself follows from this, since only negations are

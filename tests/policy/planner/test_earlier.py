@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from specshield.policy.planner.hurry import hurried
+from specshield.policy.planner.earlier import earlier_rule
 from specshield.stl import parse
 from tests.policy.rooms import flat
 
@@ -26,4 +26,4 @@ from tests.policy.rooms import flat
 def test_deadlines_come_four_steps_earlier_where_they_can(rule, t, sooner):
     task = flat(rule)
     poses = np.tile((2.5, 1.0, 0.0), (t + 1, 1))  # in the east
-    assert hurried(task, task.formula, 4, poses, np.empty((t + 1, 0))) == parse(sooner)
+    assert earlier_rule(task, task.formula, 4, poses, np.empty((t + 1, 0))) == parse(sooner)
