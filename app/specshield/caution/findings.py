@@ -40,8 +40,9 @@ def findings(told: Shield, shield: Shield, taught: Taught, now: Situation, nexts
     shield, now, judged, withstands = judged_by_signals(shield, now)
     believed = tried_again(told, taught, judged, now)
     if believed is not None:
+        if believed[0] is not taught:
+            said.append("no other way was left, so what was touched, or last seen long ago, is doubted")
         taught, (shield, now, judged, withstands) = believed
-        said.append("no other way was left, so what was touched, or last seen long ago, is doubted")
         nexts = np.empty_like(nexts)
         successors(shield.body, now.prefix.poses[-1], nexts)
     doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)

@@ -33,8 +33,9 @@ def tried_again(
     told: Shield, taught: Taught, judged: Judged, now: Situation
 ) -> tuple[Taught, tuple[Shield, Situation, Judged, bool]] | None:
     """The first guess about the map that leaves a way without motions that led nowhere before, and how the
-    actions were judged by it. If there is none and the map as marked leaves no way at all, the first guess
-    that leaves any. None if no guess is needed, or none leaves a way.
+    actions were judged by it. If there is none and the map as marked leaves no such way either, the map as
+    marked if it leaves one with such motions, else the first guess that does. None if no guess is needed, or
+    none leaves a way.
 
     told: the shield on the policy's map; judged: by the map as marked.
     """
@@ -47,6 +48,10 @@ def tried_again(
             return guess, found
         if found[2].some and vain is None and not judged.some:
             vain = guess, found
+    if not judged.some and len(taught.barred):
+        found = judged_by_signals(on_map(told, taught.map, True), now)
+        if found[2].some:
+            return taught, found
     return vain
 
 

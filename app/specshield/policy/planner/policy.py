@@ -57,7 +57,9 @@ USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effo
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
 FIRST, ON = 300_000, 20_000
-GUESSED = 0.25  # of the effort of a plan, where one decision makes several of them; chosen by hand
+# Of the effort of a plan: where one decision makes several of them, and on a map that the session has learned,
+# which may be only the first that a decision tries. Chosen by hand (docs/decisions.md).
+GUESSED, LEARNED = 0.25, 0.5
 STARTS = 50  # poses that a new policy is tried from
 FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 
@@ -94,7 +96,7 @@ class PlannerPolicy(Carded):
         what was learned, for which the newest fields are, so its fields are those of the policy's own map.
         """
         policy = self if guess or self.again is None else self.again
-        return replace(policy, share=GUESSED if guess else 1.0)._in(policy._world._replace(body=body))
+        return replace(policy, share=GUESSED if guess else LEARNED)._in(policy._world._replace(body=body))
 
     def remade(self, grid: OccupancyGrid) -> PlannerPolicy:
         """The policy, which has fields for another map of the same size beside its own from now on."""
@@ -110,10 +112,13 @@ class PlannerPolicy(Carded):
         return self._in(self._world._replace(barred=barred))
 
     def promptly(self) -> PlannerPolicy:
-        """The policy that begins responses where their answers are nearest; itself if it has no such ways."""
+        """The policy that begins responses where their answers are nearest, with less effort a plan; itself if it
+        has no such ways.
+        """
         if not (chosen := self.chosen[:, 2:]).size:
             return self
-        return replace(self, chosen=chosen)._in(self._world._replace(field=chosen.astype(np.int64)))
+        policy = replace(self, chosen=chosen, share=GUESSED * self.share)
+        return policy._in(self._world._replace(field=chosen.astype(np.int64)))
 
     def earlier(self, steps: int, wanted: Bools) -> PlannerPolicy:
         """The policy for deadlines that come so many steps earlier, with less effort a plan; itself unless a
@@ -149,16 +154,11 @@ class PlannerPolicy(Carded):
         return World(self._body, self.fields, packed, columns, band, pad, stands, cost, NOTHING_BARRED)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        """A plan from x_t, and one after each other first motion. If there is none without barred motions,
-        one with them is looked for, unless the decision has other maps to try.
-        """
-        ways, found = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
+        """A plan from x_t, and one after each other first motion."""
+        ways, _ = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
         if self.rest is not None:
             return Proposal(ways.motions[ways.motions[:, 0] == ways.preferred], ways.preferred)
-        if found or len(self._world.barred) == 0 or self.share < 1.0:
-            return ways
-        quick = self.briefly().avoiding(NOTHING_BARRED)
-        return joined(ways, quick.propose(history, signals, margin))
+        return ways
 
     def _plan(
         self, history: Floats, signals: Mapping[str, Floats], margin: float, most: int
@@ -218,7 +218,8 @@ class PlannerPolicy(Carded):
         effort = self.share * self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals, barred=self._world.barred)
         held = rows[-1] if self.foreseen is None else self.foreseen
-        allowed = effort, int(self.share * most)
+        lost = math.inf if self.share == 1.0 else effort
+        allowed = effort, lost, int(self.share * most)
         first, found = plan_all(world, t, history[-1], held, known, *allowed, motions)
         return Proposal(motions, int(first)), bool(found)
 
