@@ -90,8 +90,8 @@ def plan_all(
 
     held (S,): the values that signals keep; prefix (size,): the formula's leaves to step t; effort, lost
     [about us]: of one plan, and of all searches after first motions as long as there is no plan; most: how
-    many poses a search over exact poses may make. First a plan from x_t is looked for. Each other first motion is
-    undone to go the same way. If that comes too late, a plan after that motion is looked for.
+    many poses a search over exact poses may make. First a plan from x_t is looked for. Each other first
+    motion is undone to go the same way. If that comes too late, a plan after that motion is looked for.
     """
     count, steps = motions.shape
     way = make_way(world, t, steps, held)

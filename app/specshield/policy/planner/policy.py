@@ -57,8 +57,8 @@ USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effo
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
 FIRST, ON = 300_000, 20_000
-# Of the effort of a plan: where one decision makes several of them, and on a map that the session has learned,
-# which may be only the first that a decision tries. Chosen by hand (docs/decisions.md).
+# Of the effort of a plan: where one decision makes several, and on a map that the session has learned, which
+# may be only the first that a decision tries. docs/decisions.md says what they cost and save.
 GUESSED, LEARNED = 0.25, 0.5
 STARTS = 50  # poses that a new policy is tried from
 FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
@@ -112,8 +112,8 @@ class PlannerPolicy(Carded):
         return self._in(self._world._replace(barred=barred))
 
     def promptly(self) -> PlannerPolicy:
-        """The policy that begins responses where their answers are nearest, with less effort a plan; itself if it
-        has no such ways.
+        """The policy that begins responses where their answers are nearest, with less effort a plan; itself
+        if it has no such ways.
         """
         if not (chosen := self.chosen[:, 2:]).size:
             return self
