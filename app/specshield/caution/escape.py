@@ -24,6 +24,7 @@ POSES_A_LAYER = 1024  # poses that are simulated at each step of the search, abo
 LONGEST_ESCAPE = 24  # [steps] ways out that take longer are not searched for
 ESCAPES = 4  # ways out that are continued to the horizon: each of them asks every proposer
 POSES_A_METRE = 1e3  # [1/m, 1/rad] poses that agree when rounded to this grid count as one
+SPAN, TURN = 1 << 20, 1 << 13  # more than such a grid has points in a kilometre, and in a full turn
 
 
 class Layer(NamedTuple):
@@ -92,7 +93,9 @@ def _expand(body: Body, layer: Layer) -> Layer:
     pose = spread(body, layer.pose)
     motion, parent = np.tile(np.arange(count), len(layer.pose)), np.repeat(np.arange(len(layer.pose)), count)
     root = motion if layer.motion[0] < 0 else layer.root[parent]
-    _, once = np.unique(np.column_stack([root, np.rint(POSES_A_METRE * pose)]), axis=0, return_index=True)
+    at = np.rint(POSES_A_METRE * pose).astype(np.int64)
+    x, y, theta = (at - at.min(axis=0)).T
+    _, once = np.unique(((root * TURN + theta) * SPAN + x) * SPAN + y, return_index=True)
     once.sort()
     return Layer(pose[once], root[once], motion[once], parent[once])
 
