@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from llvmlite.binding import ffi
 from numba.core.caching import IndexDataCacheFile
+from numba.core.compiler import Flags
 from numba.core.lowering import BaseLower
 
 from specshield import episode
@@ -211,9 +212,15 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
     os.nice(int(sys.argv[2]))
-    # Left out is what takes time and nobody uses: wrappers by which C calls numba's own functions, and events
-    # at each call of LLVM.
+    # Left out is what takes time and nobody uses: wrappers by which C calls numba's own functions, events at
+    # each call of LLVM, and reading numba's options one by one to compare them at each call of a kernel.
     BaseLower.create_cfunc_wrapper = lambda _: None  # type: ignore[method-assign]
     getattr(getattr(ffi.lib, "_lock", None), "_cblist", []).clear()
+    defaults = {name: option.default for name, option in Flags.options.items()}
+    Flags.values = lambda flags: defaults | flags._values  # type: ignore[method-assign]
+    # Python takes 16 KB from the system whenever a call's frame no longer fits, until the call returns. A
+    # frame that needs more than half of 1 MB leaves the rest of it to numba's deep calls.
+    warm_up.__code__ = warm_up.__code__.replace(co_stacksize=70_000)
     _keep_all()
     warm_up(sys.argv[1])
+    os._exit(0)  # to give back what numba and LLVM hold takes a second, and nobody needs it

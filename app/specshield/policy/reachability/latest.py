@@ -269,7 +269,8 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
     here, run = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64)
     terms = Terms(width, late - 1.0, np.inf, every)
     for n in range(poses.shape[0]):
-        here[0] = poses[n]
+        for k in range(3):
+            here[0, k] = poses[n, k]
         copy_progress(status[n], run[0], scratch.status, scratch.run)
         start = 0
         for end in tables.end:
