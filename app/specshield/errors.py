@@ -20,6 +20,7 @@ SpecshieldError
 │   └── UnsupportedMediaType    a body that is not declared as a type that is taken
 ├── NotFound                    no such map, policy, session or page
 ├── MethodNotAllowed            the page is there, the method is not
+├── SessionDamaged              what was stored of the session can no longer be read
 ├── Conflict                    the request disagrees with what is stored
 │   ├── HistoryGap              poses that do not join what the server has (`expected_t`)
 │   ├── HistoryConflict         poses that overlap the stored ones and differ
@@ -159,6 +160,9 @@ class NotFound(SpecshieldError, type="not-found"): ...
 
 
 class MethodNotAllowed(SpecshieldError, type="method-not-allowed"): ...
+
+
+class SessionDamaged(SpecshieldError, type="session-damaged"): ...
 
 
 class Conflict(SpecshieldError, type="conflict"): ...

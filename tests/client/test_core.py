@@ -198,6 +198,7 @@ def test_waiting_outlasts_a_server_that_is_away_for_a_while_but_not_one_that_nev
         calls.wait_policy("p", timeout=60, interval=1),
         answer(POLICY),
         *outage,
+        *[starting("9")] * 2,  # it is there again, but not ready
         answer({**POLICY, "status": "ready"}),
     )
     assert policy.status == "ready"
@@ -268,11 +269,12 @@ def test_a_server_that_starts_for_longer_than_a_call_may_take_is_said_to():
 
 def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts(caplog):
     maps = answer({"items": [], "next": None})
-    outcomes = [lost(0.01), lost(0.01), starting("1"), answer({"status": "ok"}), maps]
+    ready = answer({"status": "ok"})  # of one process, while another is still starting
+    outcomes = [lost(0.01), lost(0.01), starting("1"), ready, starting("9"), ready, maps]
     result, sent, waits = drive(calls.wait_until_ready(10.0), *outcomes)
     assert result is None
-    assert [(request.method, request.path) for request in sent[:4]] == [("GET", "/readyz")] * 4
-    assert waits == [calls.READY_EVERY] * 3
+    assert [request.path for request in sent] == ["/readyz"] * 4 + ["/v1/maps", "/readyz", "/v1/maps"]
+    assert waits == [calls.READY_EVERY] * 4
     assert [each.getMessage().split(":")[0] for each in caplog.records] == ["waiting"] * 2  # for each once
 
 

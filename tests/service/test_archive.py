@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
 import os
 import random
 import shutil
@@ -11,7 +13,6 @@ import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,11 @@ import httpx
 import pytest
 import redis
 
-from specshield.errors import SessionExists, StoreError
+from specshield.errors import SessionDamaged, SessionExists, StoreError
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
-from specshield.service.storage.archive import Archive, Entry
+from specshield.service.storage.archive import DAMAGED, Archive, Entry, unpack
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import left_out, open_objects
@@ -376,8 +377,14 @@ def test_a_damaged_file_is_said_to_be_one(url, tmp_path):
         whole = file.read_bytes()
         for broken in (b"", whole[:-9], whole[:40] + b"?" + whole[41:], whole[:-5] + b"????" + whole[-1:]):
             file.write_bytes(broken)
-            with pytest.raises(StoreError, match="archive"):
+            with pytest.raises(SessionDamaged, match="archive"):
                 await store.dump("robot")
+        dump = unpack(whole)
+        for i, byte in enumerate(whole * 8):  # some say that very much memory is needed
+            damaged = bytearray(whole)
+            damaged[i % len(whole)] = byte ^ 1 << i // len(whole)
+            with contextlib.suppress(*DAMAGED):
+                assert unpack(damaged) == dump  # not every bit counts
         file.write_bytes(whole)
         (file.parent / "notes.txt").write_text("not ours")
         assert len((await store.dump("robot")).steps) == 3
@@ -405,7 +412,7 @@ def test_a_file_that_is_not_whole_or_not_ours_is_left_out_of_lists_and_named_onc
                 page, _ = await store.everything("ann", None, 10)
                 assert [config for config, _ in page] == [b"config of ann@whole"]
             assert [file.name in line for line in caplog.messages] == [True]
-            with pytest.raises(StoreError, match=file.name):
+            with pytest.raises(SessionDamaged, match=file.name):
                 await store.dump("ann@broken")
         assert await store.delete("ann@broken")
 
@@ -564,7 +571,7 @@ def test_a_file_that_is_written_while_its_session_is_erased_is_not_the_session(u
     run(url, archive, story)
 
 
-@contextmanager
+@contextlib.contextmanager
 def archiving(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, Any]]]:
     """A client of a server whose sessions move to the archive after a second, and how to begin one there."""
     with (
@@ -610,6 +617,21 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
         assert closed.status_code == 200
         wait_for(archived)
         assert client.post("/v1/sessions/robot/close", json=last).json() == closed.json()
+
+        (file,) = (path for path in (tmp_path / "archive").rglob("*") if path.is_file())
+        file.write_bytes(file.read_bytes()[:-9])
+        another = client.post("/v1/sessions", json={**begun, "id": "another"})
+        assert another.status_code == 201
+        for path in ("robot", "robot/trajectory", "robot/record", "robot/image.svg", "robot/events?after=-1"):
+            told = client.get(f"/v1/sessions/{path}")
+            assert (told.status_code, told.json()["type"]) == (410, "session-damaged"), path
+            assert "Retry-After" not in told.headers
+        assert step(3).status_code == 410
+        with client.stream("GET", "/v1/events?session=robot:-1&session=another:-1") as both:
+            assert client.delete("/v1/sessions/another").status_code == 204
+            told = [json.loads(line[6:])["session"] for line in both.iter_lines() if line.startswith("data")]
+            assert told == ["another"]
+        assert [item["id"] for item in client.get("/v1/sessions").json()["items"]] == ["robot"]
         assert client.delete("/v1/sessions/robot").status_code == 204
         assert client.get("/v1/sessions/robot").status_code == 404
         assert client.get("/v1/sessions").json()["items"] == []

@@ -26,7 +26,7 @@ from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
 from specshield.service.storage.store import scoped
-from specshield.service.watch.events import Watchers
+from specshield.service.watch.events import EVERY, Watchers
 from specshield.service.watch.feed import KEPT
 from tests.service.world import ahead
 from tests.serving import HUNG, serving, wait_for
@@ -320,14 +320,14 @@ def test_older_steps_are_read_and_written_once_for_all_streams(server, begin, st
     asyncio.run(watch())
 
 
-def test_an_archived_session_is_read_once_for_a_stream(server, begin, step):
+def test_an_archived_session_is_read_once_for_a_stream(server, begin, step, monkeypatch):
     session, pose, last = begin(), ahead(1)[0], 2 * KEPT
     for t in range(last + 1):
         assert step(session, t, [pose]).status_code == 200
     id, read = scoped("", session["id"]), []
 
     async def watch():
-        async with another_server(server) as (store, _):
+        async with another_server(server) as (store, watchers):
             assert await put_away(store, id)
             dump = store.dump
 
@@ -338,7 +338,36 @@ def test_an_archived_session_is_read_once_for_a_stream(server, begin, step):
             store.dump = noted
             alone = Watchers(store, 10, lambda: False, lambda: 0)  # which does not look for news
             assert await ids_told(await alone.open(id, -1), last) == [*range(last + 1)]
-        assert read == [id]
+            assert read == [id]
+            monkeypatch.setattr("specshield.service.watch.events.AWAY", 0.0)  # looks at every turn
+            stream = await watchers.open(id, None)
+            assert await anext(stream)
+            await asyncio.sleep(5 * EVERY)
+            assert read == [id, id]
+            await stream.aclose()
+
+    asyncio.run(watch())
+
+
+def test_a_session_whose_file_is_damaged_ends_its_streams_and_keeps_no_other_from_its_news(
+    server, begin, step
+):
+    lost, other = begin(), begin()
+    id = scoped("", lost["id"])
+
+    async def watch():
+        async with another_server(server) as (store, _):
+            watchers = Watchers(store, 10, lambda: False, lambda: 0)
+            streams = [await watchers.open(scoped("", each["id"]), None) for each in (lost, other)]
+            for stream in streams:
+                assert await anext(stream)
+            assert await put_away(store, id)
+            store.archive._objects.write((await store.file(id)).path, b"damaged")
+            looking = asyncio.create_task(watchers.run())
+            assert b"event: end" in await anext(streams[0])
+            assert step(other, 0, ahead(0)).status_code == 200
+            assert await ids_told(streams[1], 0) == [0]
+            looking.cancel()
 
     asyncio.run(watch())
 

@@ -13,15 +13,8 @@ from specshield.client import wire
 from specshield.client.away import OnFailure, on_failure_value
 from specshield.client.core import Flow, Wait, call, deliver, erase, fetch
 from specshield.client.models import Map, Page, Policy, SessionInfo, Spec, build
-from specshield.client.wire import Content, Failure, Numbers, Reply, Request
-from specshield.errors import (
-    InputError,
-    SessionExists,
-    SpecshieldError,
-    StoreError,
-    TransportError,
-    TransportTimeout,
-)
+from specshield.client.wire import Content, Failure, Numbers, Request
+from specshield.errors import InputError, SessionExists, SpecshieldError, TransportError, TransportTimeout
 
 log = logging.getLogger("specshield")
 READY_EVERY = 0.25  # [s] between two requests whether the server is ready
@@ -36,14 +29,18 @@ def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
     """
     if timeout not in (0.0, math.inf):  # to ask once, or for ever
         wire.seconds_value(timeout, "timeout")
+    # Many servers answer /readyz, but not the list of maps; and another process may answer that.
+    asked = Request("GET", "/readyz"), wire.get("maps", params={"limit": "1"})
     seconds, told = 0.0, SpecshieldError
     while True:
-        outcome = yield Request("GET", "/readyz")
-        seconds += outcome.seconds
-        if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
-            wire.json_object(outcome)
-            maps = wire.get("maps", params={"limit": "1"})  # many servers answer /readyz, but not this
-            build(Page, (yield from call(maps)))
+        for request in asked:
+            outcome = yield request
+            seconds += outcome.seconds
+            if isinstance(outcome, Failure) or outcome.status in wire.AWAY:
+                break
+            answered = wire.json_object(outcome)
+        else:
+            build(Page, answered)
             return
         error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
         if seconds >= timeout:
@@ -205,8 +202,9 @@ def wait_policy(
             delivery = yield from deliver(wire.get("policies", id))
             seconds += delivery.seconds
             policy = build(Policy, wire.json_object(delivery.reply))
-        except (TransportError, StoreError) as error:
-            if policy is None:
+        except SpecshieldError as error:
+            away = isinstance(error, TransportError) or error.details.get("status") in wire.AWAY
+            if policy is None or not away:
                 raise
             seconds += error.details.get("seconds", 0.0)
         else:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
 
 from specshield.client.models import Page, build
-from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
+from specshield.client.wire import AWAY, Failure, Reply, Request, check, error_of, get, json_object
 from specshield.errors import NotFound, SpecshieldError, Starting, TrainingUnavailable
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def deliver(request: Request) -> Flow[Delivery]:
         outcome = yield request
         seconds += outcome.seconds
         error: SpecshieldError | None = outcome.error if isinstance(outcome, Failure) else None
-        if isinstance(outcome, Reply) and outcome.status in (502, 503, 504):  # the server is not there now
+        if isinstance(outcome, Reply) and outcome.status in AWAY:
             error = error_of(outcome)
         if isinstance(outcome, Reply) and isinstance(error, Starting):
             wait = _asked_for(outcome)

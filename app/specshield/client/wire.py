@@ -256,7 +256,8 @@ _BY_TYPE = {cls.type: cls for cls in tree()}
 _BY_STATUS: dict[int, type[SpecshieldError]] = {
     401: Unauthorized, 403: Unauthorized, 404: NotFound, 409: Conflict, 413: BodyTooLarge,
 }  # fmt: skip
-_GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: TransportError, 504: TransportTimeout}
+# By the statuses that say that the server is not there now: the error where no server of ours says so.
+AWAY: dict[int, type[TransportError]] = {502: TransportError, 503: TransportError, 504: TransportTimeout}
 
 
 def json_object(reply: Reply) -> dict[str, Any]:
@@ -279,9 +280,9 @@ def error_of(reply: Reply) -> SpecshieldError:
     """The error that a problem document (RFC 9457) describes: its class by `type`, with all its members."""
     problem = reply.headers.get("content-type", "").startswith("application/problem+json")
     document = reply.document if problem and isinstance(reply.document, dict) else None
-    if document is None and reply.status in _GATEWAY:  # a proxy in front of the server has answered
+    if document is None and reply.status in AWAY:  # a proxy in front of the server has answered
         what = f"the server cannot be reached: status {reply.status}"
-        return _GATEWAY[reply.status](what, status=reply.status)
+        return AWAY[reply.status](what, status=reply.status)
     if document is None:
         to = reply.headers.get("location")
         what = f": the server redirects to {to}" if to else " without a problem"

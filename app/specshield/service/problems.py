@@ -47,6 +47,7 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     errors.NotFound: 404,
     errors.MethodNotAllowed: 405,
     errors.Conflict: 409,
+    errors.SessionDamaged: 410,
     errors.Unauthorized: 401,
     errors.CrossSite: 403,
     errors.MisdirectedRequest: 421,

@@ -16,7 +16,7 @@ from starlette.types import Receive, Scope, Send
 from specshield.errors import StoreError
 from specshield.service import examples
 from specshield.service.problems import until_gone
-from specshield.service.routes.sessions import GONE, PathId, SessionKey
+from specshield.service.routes.sessions import UNREADABLE, PathId, SessionKey
 from specshield.service.schemas.base import ID
 from specshield.service.sessions import chain
 from specshield.service.state import Owner, ServerState, problems
@@ -72,7 +72,7 @@ EVENT = {  # the schema of one event
             "event is `event: end`. Comments keep the connection alive.",
         },
         204: {"description": "The session is over and has no further event: do not ask again."},
-        **problems(**GONE, _429="`limit-reached`: the server has no room for more streams."),
+        **problems(**UNREADABLE, _429="`limit-reached`: the server has no room for more streams."),
     },
 )
 async def events(
@@ -107,7 +107,7 @@ async def events(
             "description": "A file for `specshield verify`.",
             "headers": {"X-Record-Seal": {"description": "The record's seal.", "schema": {"type": "string"}}},
         },
-        **problems(**GONE),
+        **problems(**UNREADABLE),
     },
 )
 async def read_record(key: SessionKey, session_id: PathId, server: ServerState) -> Response:

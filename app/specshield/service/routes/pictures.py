@@ -9,7 +9,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from specshield.service.routes.policies import PolicyId
-from specshield.service.routes.sessions import GONE, SessionKey
+from specshield.service.routes.sessions import UNREADABLE, SessionKey
 from specshield.service.state import TOO_MUCH, Owner, ServerState, problems
 
 router = APIRouter(prefix="/v1")
@@ -49,7 +49,7 @@ async def policy(policy_id: PolicyId, request: Request, server: ServerState, own
     tags=["sessions"],
     response_class=Response,
     summary="See a session",
-    responses=_drawn("The floor, the way driven, and the certified continuation.", **GONE),
+    responses=_drawn("The floor, the way driven, and the certified continuation.", **UNREADABLE),
 )
 async def session(key: SessionKey, request: Request, server: ServerState) -> Response:
     """The map, the regions of the rule, the way driven so far, and the certified continuation of the last

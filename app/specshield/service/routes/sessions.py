@@ -38,6 +38,8 @@ async def _key(session_id: PathId, owner: Owner) -> str:
 SessionKey = Annotated[str, Depends(_key)]
 NDJSON = "application/x-ndjson"
 GONE = {"_404": "No such session; it may have expired.", "_503": "The store is away: try again."}
+DAMAGED = {"_410": "`session-damaged`: the session's file in the archive can no longer be read."}
+UNREADABLE = GONE | DAMAGED
 
 
 @router.post(
@@ -78,7 +80,10 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 
 
 @router.get(
-    "/{session_id}", response_model=SessionResponse, summary="Read a session", responses=problems(**GONE)
+    "/{session_id}",
+    response_model=SessionResponse,
+    summary="Read a session",
+    responses=problems(**UNREADABLE),
 )
 async def read(key: SessionKey, server: ServerState) -> Any:
     """The session's settings and its state; `next_t` is the next step to ask for."""
@@ -104,7 +109,7 @@ async def delete(key: SessionKey, server: ServerState) -> Response:
             "description": "The decision. `Server-Timing` has total, rollout and store in ms.",
         },
         **problems(
-            **GONE,
+            **UNREADABLE,
             _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
         ),
     },
@@ -133,6 +138,7 @@ async def step(key: SessionKey, body: StepRequest) -> Response:
     responses=problems(
         _404="No such session or policy.",
         _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
+        **DAMAGED,
         _429="`limit-reached`: the session has had too many rules.",
         _503="The store is away: try again.",
     ),
@@ -155,7 +161,8 @@ async def switch(key: SessionKey, body: SwitchRequest, server: ServerState, call
     response_model=CloseResponse,
     summary="End a session",
     responses=problems(
-        **GONE, _409="`history-gap`, `history-conflict`, or `session-finished` for states after a close."
+        **UNREADABLE,
+        _409="`history-gap`, `history-conflict`, or `session-finished` for states after a close.",
     ),
 )
 async def close(key: SessionKey, body: CloseRequest, server: ServerState) -> Any:
@@ -175,7 +182,7 @@ async def close(key: SessionKey, body: CloseRequest, server: ServerState) -> Any
             "content": {NDJSON: {"schema": {"type": "string", "description": "One item in each line."}}},
             "description": "Every state, with the answer that was given there.",
         },
-        **problems(**GONE),
+        **problems(**UNREADABLE),
     },
 )
 async def trajectory(
@@ -201,7 +208,7 @@ async def trajectory(
     "/{session_id}/learned",
     response_class=Response,
     summary="Read what the session learned of the map",
-    responses={200: {"model": Learned}, **problems(**GONE)},
+    responses={200: {"model": Learned}, **problems(**UNREADABLE)},
 )
 async def learned(key: SessionKey, server: ServerState) -> Response:
     """The cells that differ from the map, as `occupied` and `free` points and contacts have shown. Cells have

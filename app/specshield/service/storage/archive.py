@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import msgspec
 import zstandard
 
-from specshield.errors import StoreError
+from specshield.errors import SessionDamaged
 from specshield.service.storage.objects import Objects, left_out
 from specshield.service.storage.store import Dump, scoped
 
@@ -27,6 +27,7 @@ MAGIC = b"specshield session 1\n"
 FOLDER = 8  # characters of an id that name its folder; ids that the server makes in one minute share them
 LEVEL = 3  # of zstandard; see docs/scale.md for what it costs
 NAME = re.compile(r"([0-9a-f]{8,16}),([0-9a-f]+),([0-9a-f]{9,16})")
+MOST = 1 << 32  # bytes that a head or a body may have; what says it has more is damaged
 FIRST = 8192  # bytes that are read first: most heads lie within them
 HEAD = msgspec.msgpack.Decoder(tuple[bytes, bytes, bytes])
 BODY = msgspec.msgpack.Decoder(tuple[bytes, list[bytes]])
@@ -87,12 +88,17 @@ class Archive:
         return kept[-1] if kept else None
 
     def read(self, entry: Entry) -> Dump | None:
-        """The session in a file; None if it was removed meanwhile. Raises StoreError for a damaged file."""
+        """The session in a file; None if it was removed meanwhile. Raises SessionDamaged, and a line of the
+        log says so once.
+        """
         content = self._objects.read(entry.path)
         try:
             return None if content is None else unpack(content)
         except DAMAGED as error:
-            raise StoreError(_damaged(entry, error)) from error
+            left_out(told := _damaged(entry, error))
+            raise SessionDamaged(
+                told, expected="the file as it was, from a backup, or a new session"
+            ) from error
 
     def head(self, entry: Entry) -> tuple[bytes, bytes] | None:
         """(config, state), without reading the rest of the file. None if it was removed meanwhile or is
@@ -170,6 +176,8 @@ def _compressed(value: object) -> bytes:
 
 
 def _decompressed(content: bytes) -> bytes:
+    if zstandard.frame_content_size(content) > MOST:
+        raise ValueError(f"it holds more than {MOST} bytes")
     return zstandard.ZstdDecompressor().decompress(content, allow_extra_data=False)
 
 

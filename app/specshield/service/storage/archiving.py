@@ -18,7 +18,7 @@ from typing import ParamSpec, TypeVar
 
 import anyio
 
-from specshield.service.storage.archive import Archive
+from specshield.service.storage.archive import Archive, Entry
 from specshield.service.storage.store import (
     INDEX,
     PAGE_BYTES,
@@ -93,7 +93,7 @@ class ArchivingStore(Store):
         self._files = anyio.CapacityLimiter(AT_ONCE)
 
     async def create(self, id: str, config: bytes, change: Change, *limits: tuple[str | None, int]) -> bytes:
-        if await self.in_thread(self.archive.find, id) is not None and not await self._was_erased(id):
+        if await self.file(id) is not None and not await self._was_erased(id):
             raise exists(id)
         return await super().create(id, config, change, *limits)
 
@@ -118,6 +118,10 @@ class ArchivingStore(Store):
     async def dump(self, id: str) -> Dump | None:
         found = await super().dump(id)
         return found if found is not None else await self._in_archive(id)
+
+    async def file(self, id: str) -> Entry | None:
+        """The file of a session in the archive. As long as it is the same, so is what is in it."""
+        return await self.in_thread(self.archive.find, id)
 
     async def delete(self, id: str) -> bool:
         """Erases a session in store and archive. False if there was none."""
@@ -154,7 +158,7 @@ class ArchivingStore(Store):
                 found.append((config, state))
                 continue
             kept = None if id in running else archived.get(id)  # one that has just left has a newer file
-            entry = kept or await self.in_thread(self.archive.find, id)
+            entry = kept or await self.file(id)
             head = None if entry is None else await self.in_thread(self.archive.head, entry)
             if head is not None:
                 found.append(head)

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 
 from specshield.arrays import Floats
-from specshield.errors import LimitReached, NotFound, SpecshieldError
+from specshield.errors import LimitReached, NotFound, SessionDamaged, SpecshieldError
 from specshield.service import metrics
 from specshield.service.library.files import Recent
 from specshield.service.schemas.answers import StepAnswer
@@ -25,7 +25,8 @@ from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
-from specshield.service.storage.store import Dump, News, Store, shown
+from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.store import Dump, News, shown
 from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
 # All chosen by hand.
@@ -50,7 +51,7 @@ class Watchers:
     """
 
     def __init__(
-        self, store: Store, limit: int, stopping: Callable[[], bool], deciding: Callable[[], int]
+        self, store: ArchivingStore, limit: int, stopping: Callable[[], bool], deciding: Callable[[], int]
     ) -> None:
         self._store, self._limit, self._stopping, self._deciding = store, limit, stopping, deciding
         self._feeds: dict[str, Feed] = {}
@@ -113,12 +114,12 @@ class Watchers:
 
     async def open_all(self, after: Mapping[str, int | None], owner: str = "") -> AsyncIterator[bytes]:
         """One stream of the decisions of several sessions, each after its own step. Sessions that do not
-        exist are left out. Raises LimitReached.
+        exist, or cannot be read, are left out. Raises LimitReached.
         """
         self._check_room(owner)
         places = {}
         for id, t in after.items():
-            with contextlib.suppress(NotFound):
+            with contextlib.suppress(NotFound, SessionDamaged):
                 feed = self._feeds.get(id) or await self._begin(id)
                 places[feed] = feed.end if t is None else t + 1
         return self._stream(places, owner, several=True)
@@ -234,17 +235,26 @@ class Watchers:
 
     async def _left(self, feed: Feed) -> None:
         """The session is no longer in the store: it was erased, or lies in the archive."""
-        known, dump, feed.looked = feed.version, await self._store.dump(feed.id), time.monotonic()
+        known, file = feed.version, await self._store.file(feed.id)
+        feed.looked = time.monotonic()
+        read = file is not None and file == feed.file  # then nothing is new
+        dump = None if read else await self._dump(feed)
         if feed.version != known:  # a step of this process has brought it back meanwhile
             return
-        if dump is None or not feed.rule(Session.of(dump)):
+        if not read and (dump is None or not feed.rule(Session.of(dump))):
             self._archived.drop(feed)
             feed.close()
-        else:
+        elif dump is not None:
             new = News(dump.state, dump.version, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
             state, (found, _) = State.of(dump.state), feed.events(feed.end, new)
             feed.add(state, found, state.next_t, state.next_t)
-        feed.version = None
+        feed.version, feed.file = None, file
+
+    async def _dump(self, feed: Feed) -> Dump | None:
+        """The session; None if it was erased, or its file is damaged."""
+        with contextlib.suppress(SessionDamaged):
+            return await self._store.dump(feed.id)
+        return None
 
     async def _since(self, feed: Feed, t: int) -> tuple[list[Told], int]:
         """Decisions from step t on, and the step that follows them. Older ones are read from the store."""
@@ -258,7 +268,7 @@ class Watchers:
         if new is None:
             dump = self._archived.peek(feed)
             if dump is None or len(dump.steps) <= t:  # it may have been away from the archive in between
-                dump = await self._store.dump(feed.id)
+                dump = await self._dump(feed)
                 if dump is None or not feed.rule(Session.of(dump)):
                     return [], feed.end
                 self._archived.put(feed, dump)

@@ -20,6 +20,7 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import Rule
 from specshield.service.sessions.session import Session, describe
 from specshield.service.sessions.state import State
+from specshield.service.storage.archive import Entry
 from specshield.service.storage.store import News, shown
 
 KEPT = 64  # events that are kept for the watchers of a session, and the most that are read at once
@@ -64,7 +65,8 @@ class Feed:
 
     recent: the decisions of the steps from `start` to before `end`. version: the last one that was read; None
     if the session is not in the store, b"" if it has come back and was not read yet. looked: when it was last
-    looked for in the archive; here: when this process last decided a step of it [s of time.monotonic].
+    looked for in the archive; here: when this process last decided a step of it [s of time.monotonic]. file:
+    the file of the archive that was read last.
     """
 
     id: str
@@ -79,6 +81,7 @@ class Feed:
     watchers: int = 0
     here: float = -math.inf
     looked: float = -math.inf
+    file: Entry | None = None
     recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
