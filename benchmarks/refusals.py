@@ -106,9 +106,9 @@ def main() -> None:
 def _tightness(task: Task, body: Body, pose: Floats, parts: list[Part], gaps: Counter[int]) -> None:
     relaxed = relaxations(make_shield([Still(task)]), pose[None], {})
     for part, told in zip(parts, relaxed.conjuncts, strict=True):
-        if part.is_goal and not told.feasible_alone and told.late_by is not None:
+        if part.is_goal and not told.feasible_alone and told.late is not None:
             by = earliest(body, STRETCH.wait_motion, pose[None], [part.later(200)], part.b + 200)
-            gaps[told.late_by - (by - part.dwell - part.b)] += 1
+            gaps[told.late.steps - (by - part.dwell - part.b)] += 1
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ model being noise; then comes another rule, another map or both, with either clo
 history that there are, `keepable` tries every future, with nothing of the shield but f. Where one keeps the
 new rule, the switch has to be taken and the rule has to be kept to its end, by benchmarks/judge.py. Where
 none does, it has to be refused, and the session has to be as it was; where the refusal says by how much later
-one window would have to end, that rule has to be taken, and kept.
+one window would have to end, or how much smaller a region has to be that the rule keeps out of, that rule has
+to be taken, and kept.
 """
 
 from __future__ import annotations
@@ -153,11 +154,11 @@ def one(service: Service, number: int, seed: int) -> tuple[str, str]:
                 return what, "REFUSED, and something changed"
             if possible:
                 return what, "REFUSED, a way was there"
-            looser = relaxed(new, error.details.get("conjuncts", ()))
+            change, looser = relaxed(new, error.details.get("conjuncts", ()), random)
             if looser is None:
                 session.step(pose, random.normal(0.0, 2.0, len(robot.actions)))
                 return what, "refused, no way was there"
-            how, new = "refused, no way was there; its relaxation: ", looser
+            how, new = f"refused, no way was there; with {change}: ", looser
             try:
                 session.switch(service.policy(new), clock=clock, **with_pose)
             except InfeasibleSwitch:
@@ -182,20 +183,29 @@ def drive(session: Session, pose: Floats, random: np.random.Generator) -> list[F
     return driven
 
 
-def relaxed(world: World, conjuncts: Sequence[Mapping[str, Any]]) -> World | None:
-    """The world with the later end of one window that a refusal names as enough; None where it names none."""
+def relaxed(
+    world: World, conjuncts: Sequence[Mapping[str, Any]], random: np.random.Generator
+) -> tuple[str, World | None]:
+    """One of the changes that a refusal names as enough for the whole rule, and the world with it; None where
+    it names none.
+    """
     if len(conjuncts) != len(world.parts) or not all(each["feasible_alone"] for each in conjuncts):
-        return None
-    late = [(each["late_by"], i) for i, each in enumerate(conjuncts) if each["late_by"] is not None]
-    if not late:
-        return None
-    steps, i = min(late)
-    part, parts = world.parts[i], list(world.parts)
-    later = {"FG": {"c1": part.c1 + steps}, "G": {"a": part.a + steps}, "F": {"b": part.b + steps}}
-    parts[i] = replace(part, **later[part.kind])
+        return "", None
+    named = [(what, i) for i, each in enumerate(conjuncts) for what in ("late_by", "regions") if each[what]]
+    if not named:
+        return "", None
+    what, i = named[random.integers(len(named))]
+    part, parts, regions = world.parts[i], list(world.parts), dict(world.regions)
+    if what == "late_by":
+        steps = conjuncts[i]["late_by"]
+        later = {"FG": {"c1": part.c1 + steps}, "G": {"a": part.a + steps}, "F": {"b": part.b + steps}}
+        parts[i] = replace(part, **later[part.kind])
+    else:
+        regions |= conjuncts[i]["regions"]
     formula = " and ".join(part.text for part in parts)
-    task = make_task(world.task.grid, world.task.robot, formula, world.regions)
-    return replace(world, parts=parts, task=task)
+    task = make_task(world.task.grid, world.task.robot, formula, regions)
+    change = "a later end" if what == "late_by" else "a smaller keep-out"
+    return change, replace(world, parts=parts, regions=regions, task=task)
 
 
 def main() -> None:

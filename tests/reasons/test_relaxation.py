@@ -7,18 +7,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from specshield.episode import decide, make_shield
+from specshield.episode import Config, decide, make_shield
 from specshield.episode.handover import begun
+from specshield.errors import InfeasibleStart
 from specshield.policy.planner.policy import Settings as Plan
 from specshield.policy.planner.policy import synthesise as synthesise_plans
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.lateness import driven
 from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations, way
+from specshield.reasons.smaller import STEP, most_steps, smaller
 from specshield.robot import robot_from_json
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
-from tests.oracles.cells import CELL, Cells, Scripted, waits
+from specshield.world.regions import Circle, Polygon, Rectangle, Union, signed_distance
+from tests.oracles.cells import CELL, ROBOT, STATES, Cells, Scripted, waits, ways
 from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
@@ -26,6 +29,10 @@ PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
 
 def cells_of(parts):
     return visits(parts, PLACES)[0]
+
+
+def steps_late(told):
+    return told.late and told.late.steps
 
 
 def exists(parts, history):
@@ -49,16 +56,101 @@ def test_each_conjunct_alone_and_how_late_it_is():
             others = [other for other in parts if other != part]
             assert told.feasible_alone == exists([part], history)
             assert (told.robustness > 0.0) <= told.feasible_alone
-            if told.late_by is None:
+            if steps_late(told) is None:
                 seen["unknown"] += 1
                 continue
             beside = others if told.feasible_alone else []
             seen["beside" if beside else "alone"] += 1
-            assert end + told.late_by > 6 or exists(
-                [*beside, (op, start, end + told.late_by, place)], history
+            assert end + steps_late(told) > 6 or exists(
+                [*beside, (op, start, end + steps_late(told), place)], history
             )
-            assert not exists([*beside, (op, start, min(end + told.late_by - 1, 6), place)], history)
+            assert not exists([*beside, (op, start, min(end + steps_late(told) - 1, 6), place)], history)
     assert min(seen.values()) >= 3, seen
+
+
+def depths(region, smaller, grown, history, n=6):
+    """How deep [m] each of all n motions' poses are in a region that is so much smaller, as in `Cells`."""
+    cells = cells_of([("F", 0, 6, "A")])
+    now = np.full(len(ways(n)), STATES.index(cells.state(history[-1])))
+    at = [now] + [now := cells.table[now, column] for column in ways(n).T]
+    x, y = (np.array(STATES)[np.array(at).T, :2] + 0.5).transpose(2, 0, 1) * CELL
+    if region["type"] == "circle":
+        distance = np.hypot(x - region["center"][0], y - region["center"][1])
+        return region["radius"] - smaller - distance + grown
+    low, high = np.array(region["min"]) + smaller, np.array(region["max"]) - smaller
+    dx, dy = np.minimum(x - low[0], high[0] - x), np.minimum(y - low[1], high[1] - y)
+    return np.where((dx < 0) & (dy < 0), -np.hypot(dx, dy), np.minimum(dx, dy)) + grown
+
+
+def test_how_much_smaller_a_keep_out_has_to_be_and_a_session_begins_with_it_so():
+    """Also two regions of one keep-out, of which one is far from every way."""
+    random, seen = np.random.default_rng(11), {"alone": 0, "beside": 0, "unknown": 0, "two": 0}
+    far = {"type": "circle", "center": [0.9, 0.9], "radius": 0.05}
+    place_a = {"type": "rectangle", "min": [0.4, 0.0], "max": [0.6, 0.2]}
+    for k in range(120):
+        (x, y), r, end = random.uniform(0.1, 0.9, 2).round(2), float(random.uniform(0.1, 0.4)), 3 + k % 4
+        region = {"type": "circle", "center": [x, y], "radius": r}
+        if k % 2:
+            region = {"type": "rectangle", "min": [x - r, y - r / 2], "max": [x + r, y + r / 2]}
+        grown, out = (0.09, "touches(K)") if k % 3 else (0.0, "K")
+        away = bool(random.integers(2)) and k % 5 > 0
+        keeps_out = f"G[{k % 3},6] not ({out} or L)" if away else f"G[{k % 3},6] not {out}"
+        cells = cells_of([("F", 0, 6, "A")])
+        regions = {**cells.task.regions, "K": region, **({"L": far} if away else {})}
+        task = make_task(cells.task.grid, ROBOT, f"F[0,{end}] A and {keeps_out}", regions)
+        history = np.array([cells.pose(int(random.integers(0, 3)), 0, int(random.integers(4)))])
+        reaches = (depths(place_a, 0.0, 0.0, history)[:, : end + 1] > 0.0).any(axis=1)
+        size = int(100 * (r if region["type"] == "circle" else r / 2) - 1e-6)
+        beside = depths(far, 0.0, 0.0, history) < 0.0 if away else True
+        out_of = [
+            ((depths(region, 0.01 * steps, grown, history) < 0.0) & beside)[:, k % 3 :].all(axis=1)
+            for steps in range(size + 1)
+        ]
+        if (out_of[0] & reaches).any():
+            continue
+        shield = make_shield([Scripted(SimpleNamespace(task=task), waits)])
+        visit, kept = relaxations(shield, history, {}).conjuncts
+        assert (visit.feasible_alone, kept.feasible_alone) == (reaches.any(), out_of[0].any())
+        both = reaches if visit.feasible_alone and kept.feasible_alone else True
+        enough = [steps for steps, out in enumerate(out_of) if (out & both).any()]
+        if (kept.feasible_alone and not visit.feasible_alone) or not enough:
+            assert kept.smaller is None
+            seen["unknown"] += 1
+            continue
+        seen["alone" if both is True else "beside"] += 1
+        seen["two"] += away
+        assert kept.smaller.by == pytest.approx(0.01 * enough[0])
+        assert kept.smaller.regions.keys() == {"K"}
+        formula = task.formula if kept.smaller.only else kept.formula
+        assert kept.smaller.only == bool((out_of[enough[0]] & reaches).any())
+        made = make_task(task.grid, ROBOT, str(formula), {**regions, **kept.smaller.regions})
+        feasible, _ = begin(make_shield([Scripted(SimpleNamespace(task=made), waits)]), history[0], False)
+        assert feasible
+    assert min(seen.values()) >= 5, seen
+
+
+def test_a_smaller_region_is_the_points_so_deep_in_it():
+    """Of a polygon with a corner that points inwards: a part of them."""
+    random, points, seen = np.random.default_rng(2), np.random.default_rng(3).uniform(-1.2, 1.2, (400, 2)), 0
+    for k in range(60):
+        n = 4 + k % 7
+        angle = (np.arange(n) + random.uniform(0.0, 0.7, n)) * (2 * np.pi / n)
+        far = 1.0 if k % 2 else random.uniform(0.3, 1.0, n)
+        corners = np.column_stack([far * np.cos(angle), far * np.sin(angle)])
+        region = Polygon(tuple(map(tuple, corners[:: 1 if k % 3 else -1].tolist())))
+        depth, most = signed_distance(region, points), most_steps(region)
+        assert smaller(region, most + 1) is None
+        for steps in {1, most // 2, most} - {0}:
+            inside = signed_distance(smaller(region, steps), points) > 0.0
+            assert (depth[inside] > STEP * steps - 1e-4).all()
+            if k % 2:  # it is convex
+                seen += 1
+                assert inside[depth > STEP * steps + 1e-4].all()
+    assert seen > 60
+    parts = Union((Circle((0.0, 0.0), 0.055), Rectangle((1.0, 1.0), (3.0, 2.0))))
+    assert smaller(parts, 3) == Union((Circle((0.0, 0.0), 0.025), Rectangle((1.03, 1.03), (2.97, 1.97))))
+    assert smaller(parts, 40) == Union((Rectangle((1.4, 1.4), (2.6, 1.6)),))
+    assert (most_steps(parts), smaller(parts, 50)) == (49, None)
 
 
 def test_how_late_an_until_and_a_place_to_be_in_come():
@@ -70,10 +162,10 @@ def test_how_late_an_until_and_a_place_to_be_in_come():
             if cells.feasible(history).any():
                 continue
             (told,) = relaxations(make_shield([Scripted(cells, waits)]), history, {}).conjuncts
-            if told.late_by is not None:
+            if steps_late(told) is not None:
                 seen += 1
-                assert rule(at + told.late_by).feasible(history).any()
-                assert not rule(at + told.late_by - 1).feasible(history).any()
+                assert rule(at + steps_late(told)).feasible(history).any()
+                assert not rule(at + steps_late(told) - 1).feasible(history).any()
     assert seen >= 4
 
 
@@ -127,13 +219,19 @@ def test_a_later_end_that_is_named_is_the_first_that_is_enough_and_a_session_beg
         if enough[0]:
             continue
         told = relaxations(make_shield([Scripted(cells[0], waits)]), history, {})
-        late = told.conjuncts[which].late_by
+        late = steps_late(told.conjuncts[which])
         seen.add(late)
         assert late == enough.index(True) if True in enough else late is None or late >= len(enough)
         if late is not None:
             eased = Cells(*rule(late), places)
             feasible, _ = begin(make_shield([Scripted(eased, waits)]), history[0].tolist(), False)
             assert feasible
+            for longest in (eased.task.horizon, eased.task.horizon - 1):
+                shield = make_shield([Scripted(cells[0], waits)], Config(max_steps=longest))
+                with pytest.raises(InfeasibleStart) as refused:
+                    begin(shield, history[0].tolist(), False)
+                named = refused.value.details["conjuncts"][which]["late_by"]
+                assert named == (late if longest == eased.task.horizon else None)
     assert len(seen) >= 2, seen
 
 
@@ -211,7 +309,7 @@ def test_a_rule_that_is_over_and_was_not_kept_could_still_be_kept_later():
     told = refusal(shield(parts), history, {})
     assert told.proved
     assert "F[0,1] A is broken already" in told.message or "breaks" in told.message
-    assert told.conjuncts[0].late_by == 4  # at step 5
+    assert steps_late(told.conjuncts[0]) == 4  # at step 5
 
 
 def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
@@ -224,7 +322,7 @@ def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
     task = make_task(OccupancyGrid(free, 0.1), robot, "F[0,12] East", places)
     found = relaxations(make_shield([synthesise(task)]), np.array([[1.5, 1.5, 0.0]]), {})
     assert found.way is None
-    assert (found.conjuncts[0].late_by, found.conjuncts[0].feasible_alone) == (1, False)
+    assert (steps_late(found.conjuncts[0]), found.conjuncts[0].feasible_alone) == (1, False)
 
 
 @pytest.mark.parametrize("heading", [1, 2, 3])
@@ -295,4 +393,4 @@ def test_a_rule_of_which_much_or_a_negation_is_left_is_refused_with_its_parts(ru
     cells = Cells(rule, None, PLACES)
     told = relaxations(make_shield([Scripted(cells, waits)]), np.array([cells.pose(0, 0, 2)]), {})
     assert [each.feasible_alone for each in told.conjuncts] == alone
-    assert told.conjuncts[1].late_by == late
+    assert steps_late(told.conjuncts[1]) == late

@@ -14,7 +14,7 @@ from specshield import shipped
 from specshield.policy.methods import Run
 from specshield.policy.planner import policy as planner
 from specshield.robot import robot_from_json
-from specshield.service.schemas.base import Problem
+from specshield.service.schemas.problems import Problem
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files

@@ -51,7 +51,7 @@ def signalled(prefix):
     return {"formula": formula, "regions": {"End": END}, "signals": dict.fromkeys(names, 0.0)}
 
 
-CONJUNCT = {"formula", "feasible_alone", "robustness", "late_by"}
+CONJUNCT = {"formula", "feasible_alone", "robustness", "late_by", "smaller_by", "regions"}
 
 
 def driven(step, session, poses, since=0):
@@ -220,6 +220,24 @@ def test_a_history_that_counts_and_one_that_does_not(begin, step, switch):
     shown = switch(session, 5, BOTH, clock="keep").json()
     assert (shown["rules"][1]["from"], shown["rules"][1]["origin"]) == (5, 0)
     assert step(session, 5, poses[5:6]).json()["mode"] == "shaped"
+
+
+def test_a_refusal_names_a_smaller_keep_out_that_is_taken_as_it_is(client, begin, step, switch):
+    """The robot was at x = 2.0 m, 0.15 m deep in Wet, when the new rule's windows had begun already."""
+    session, poses = begin(), ahead(7)
+    driven(step, session, poses[:7])
+    corners = [[1.65, 1.35], [2.6, 1.35], [2.6, 1.85], [1.65, 1.85]]
+    wet = {"type": "polygon", "vertices": corners}
+    spec = {"formula": "F[0,16] End and G[0,16] not Wet", "regions": {"End": END, "Wet": wet}}
+    refused = problem(switch(session, 7, spec), 422, "infeasible-switch")
+    reach, keep_out = refused["conjuncts"]
+    assert (reach["smaller_by"], reach["regions"], reach["feasible_alone"]) == (None, None, True)
+    assert (keep_out["smaller_by"], keep_out["feasible_alone"], keep_out["late_by"]) == (0.16, False, None)
+    taken = {**spec, "regions": {**spec["regions"], **keep_out["regions"]}}
+    assert keep_out["regions"]["Wet"]["vertices"][0] == [1.81, 1.51]
+    assert refused["detail"].endswith("is broken already; with Wet smaller by 0.16 m all round, one does")
+    assert switch(session, 7, taken).status_code == 200
+    assert step(session, 7, poses[7:8]).json()["mode"] == "shaped"
 
 
 def test_another_robot_with_other_signals_and_back(server, client, begin, step, switch, capsys, tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -21,7 +21,9 @@ from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Signals
+from specshield.task import MAX_HORIZON
 from specshield.world.learned import SENT, forget
+from specshield.world.regions import region_to_json
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
 LONGEST = 400
@@ -44,16 +46,20 @@ class Refusal:
                 "formula": str(each.formula)[:LONGEST],
                 "feasible_alone": each.feasible_alone,
                 "robustness": finite(each.robustness),
-                "late_by": each.late_by,
+                "late_by": each.late and each.late.steps,
+                "smaller_by": each.smaller and each.smaller.by,
+                "regions": each.smaller and {n: region_to_json(r) for n, r in each.smaller.regions.items()},
             }
             for each in self.conjuncts[:MOST_SHOWN]
         ]
         return {"proved": self.proved, "conjuncts": shown}
 
 
-def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tuple[bool, bytes | None]:
+def begin(
+    shield: Shield, pose: Sequence[float], allow_infeasible: bool, longest: int = MAX_HORIZON
+) -> tuple[bool, bytes | None]:
     """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule; and such a
-    way (`Carry.way`) if a search found one and no policy did.
+    way (`Carry.way`) if a search found one and no policy did. longest: as of `refusal`.
 
     Raises InputError for a session that would end before its rule is decided, PoseError, and InfeasibleStart
     unless `allow_infeasible`.
@@ -68,7 +74,7 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
     except InfeasibleStart as error:
         if allow_infeasible:
             return False, None
-        told = refusal(shield, np.array([pose], np.float64), {})
+        told = refusal(shield, np.array([pose], np.float64), {}, longest=min(longest, most or longest))
         if told.way is not None:
             with suppress(InfeasibleStart):
                 start(shield, pose, told.way)
@@ -78,10 +84,15 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
 
 
 def switch(
-    shield: Shield, history: Floats, signals: Signals | None, carry: Carry, elsewhere: bool
+    shield: Shield,
+    history: Floats,
+    signals: Signals | None,
+    carry: Carry,
+    elsewhere: bool,
+    longest: int = MAX_HORIZON,
 ) -> bytes | None:
     """`check_switch`, but a way is returned if a search found one and no policy did, as by `begin`; and the
-    InfeasibleSwitch says what is wrong with the rule.
+    InfeasibleSwitch says what is wrong with the rule. longest: as of `refusal`.
     """
     try:
         check_switch(shield, history, signals, carry, elsewhere)
@@ -90,7 +101,7 @@ def switch(
         taught, _ = teach(shield, carry, history, None, None)
         known = taught.map
         sure = on_map(shield, forget(known, known.occupied & (known.by != SENT)))  # contacts are guesses
-        told = refusal(on_map(shield, known), history, signals or {}, sure.body)
+        told = refusal(on_map(shield, known), history, signals or {}, sure.body, longest)
         if told.way is not None:
             found = carry._replace(way=told.way)
             with suppress(InfeasibleSwitch):
@@ -100,17 +111,22 @@ def switch(
 
 
 def refusal(
-    shield: Shield, history: Floats, signals: Mapping[str, Floats], sure: Body | None = None
+    shield: Shield,
+    history: Floats,
+    signals: Mapping[str, Floats],
+    sure: Body | None = None,
+    longest: int = MAX_HORIZON,
 ) -> Refusal:
     """Why the shield's rule cannot be kept after x_0..x_t, or was not found to be.
 
     history [t + 1, 3], signals {name: [t + 1]}, which are taken to keep their last values; sure: the robot on
-    a map without guesses; what is proved is proved on that map.
+    a map without guesses; what is proved is proved on that map. longest: the longest horizon that a rule may
+    have there [steps]; no later end is named that would be beyond it.
     """
     if not shield.task.formula.names:
         said = "the rule reads neither poses nor signals, and its robustness is not above 0"
         return Refusal(f"no way from here keeps the rule: {said}", True, ())
-    relaxed = relaxations(shield, history, signals)
+    relaxed = relaxations(shield, history, signals, longest)
     if relaxed.way is not None:
         return Refusal(
             f"the policies found no way from here that keeps the rule, though a search found one "
@@ -121,7 +137,8 @@ def refusal(
         )
     bound = proof(shield.task, sure or shield.body, history, signals)
     if bound is not None:
-        return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
+        instead = f"; with {ways}, one does" if (ways := _ways(relaxed.conjuncts)) else ""
+        return Refusal(f"no way from here keeps the rule: {bound}{instead}", True, relaxed.conjuncts)
     message = (
         "no way from here was found that keeps the rule, which is no proof that there is none. "
         f"{_wrong(relaxed.conjuncts, relaxed.tried).removesuffix('.')}"
@@ -135,25 +152,31 @@ def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
     if failing:
         alone = "Even with the rest of the rule left out, on" if len(conjuncts) > 1 else "On"
         return " ".join(_fails(each, f"{alone} the best of {tried} ways tried") for each in failing)
-    late = [each for each in conjuncts if each.late_by is not None]
-    if late:
-        return f"Each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}."
+    if ways := _ways(conjuncts):
+        return f"Each part can be kept alone, and all can with {ways}."
     return "Each part can be kept alone, but no way was found to keep all of them."
 
 
 def _fails(conjunct: Conjunct, best: str) -> str:
-    if conjunct.late_by is not None:
-        found = f" With {_eased(conjunct)} a way for the whole rule was found"
-        instead = f"{found}; a change by fewer steps is not ruled out."
-        told = f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}."
-        return told + (instead if conjunct.only else "")
     missed = f" by {abs(conjunct.robustness):.3g}" if math.isfinite(conjunct.robustness) else ""
-    return f"{best} '{_shown(conjunct)}' is missed{missed}."
+    told = f"{best} '{_shown(conjunct)}' is missed{missed}."
+    if conjunct.late is not None:
+        told = f"{best} {when(conjunct.formula, conjunct.late.steps)[: 3 * LONGEST]}."
+    if ways := _ways([conjunct]):
+        told += f" With {ways} a way for the whole rule was found; a smaller change is not ruled out."
+    return told
 
 
-def _eased(conjunct: Conjunct) -> str:
-    eased = later(conjunct.formula, conjunct.late_by or 0)
-    return f"'{str(eased)[:LONGEST]}' in place of '{_shown(conjunct)}'"
+def _ways(conjuncts: Sequence[Conjunct]) -> str:
+    """What would do for the whole rule, in words; "" if nothing was found."""
+    return " or with ".join(way for each in conjuncts for way in _eased(each))
+
+
+def _eased(conjunct: Conjunct) -> Iterator[str]:
+    if (late := conjunct.late) and late.only:
+        yield f"'{str(later(conjunct.formula, late.steps))[:LONGEST]}' in place of '{_shown(conjunct)}'"
+    if (less := conjunct.smaller) and less.only:
+        yield f"{' and '.join(less.regions)[:LONGEST]} smaller by {less.by:.2f} m all round"
 
 
 def _shown(conjunct: Conjunct) -> str:

@@ -7,7 +7,7 @@ some future.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -19,15 +19,20 @@ from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
 from specshield.reasons.lateness import driven, later, may_be_late, values_of
 from specshield.reasons.search import MOST_NODES, search
+from specshield.reasons.smaller import STEP, kept_out, most_steps, smaller
 from specshield.robot.dynamics import calmest_motion
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import futures, prefix_of
 from specshield.shield.proposal import adapted
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 from specshield.stl.conjunction import is_predicate
+from specshield.task import MAX_HORIZON, Task
+from specshield.world.regions import Region
 
 MOST_LATE = 150  # [steps] the most by which a window is tried to end later. Chosen by hand
 MOST_PROBED, PROBE = 100_000, 20_000  # poses in searches for later ends: in all, and in one. By hand
+Regions = Mapping[str, Region]
+NO_REGIONS: Regions = {}
 MOST_CONJUNCTS = 8  # that are searched for; further ones are judged by the policies' futures alone
 
 
@@ -36,17 +41,34 @@ class Conjunct(NamedTuple):
 
     feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
     highest found [m], among the futures that keep all other conjuncts if there are any and it is feasible
-    alone, else among all; -inf if nothing was tried. late_by: by how many steps its window would have to end
-    later (that of a G over a predicate, to begin later), for the whole rule if it is feasible alone, else for
-    the conjunct alone; None if no number was found that is enough. only: whether this is all that the whole
-    rule lacks.
+    alone, else among all; -inf if nothing was tried. late, smaller: what would do for the whole rule if it is
+    feasible alone, else for the conjunct alone; None if nothing was found that is enough.
     """
 
     formula: Formula
     feasible_alone: bool
     robustness: float
-    late_by: int | None
-    only: bool = False
+    late: Late | None
+    smaller: Smaller | None
+
+
+class Late(NamedTuple):
+    """By how many steps a window would have to end later, or that of a G over a predicate to begin later.
+    only: whether that is all that the whole rule lacks.
+    """
+
+    steps: int
+    only: bool
+
+
+class Smaller(NamedTuple):
+    """By how much [m] the regions of a keep-out would have to be smaller all round, and the regions as they
+    would then be. only: as of `Late`.
+    """
+
+    by: float
+    regions: dict[str, Region]
+    only: bool
 
 
 class Relaxed(NamedTuple):
@@ -59,15 +81,18 @@ class Relaxed(NamedTuple):
     way: bytes | None
 
 
-def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Relaxed:
+def relaxations(
+    shield: Shield, history: Floats, signals: Mapping[str, Floats], longest: int = MAX_HORIZON
+) -> Relaxed:
     """What of a rule that reads something cannot be kept after x_0..x_t, history [t + 1, 3], signals
-    {name: [t + 1]}.
+    {name: [t + 1]}. longest: the longest horizon that a rule may have there [steps].
     """
     gathered = _Gathered(shield, Known(shield.task, history, signals), conjuncts(shield.task.formula))
-    late = _gather(gathered)
+    late, shrunk = _gather(gathered, longest)
     rho = np.concatenate(gathered.rho, axis=1)
     keeps = rho > SATISFIED_ABOVE
-    told = tuple(_told(part, i, rho, keeps, late.get(i)) for i, part in enumerate(gathered.parts))
+    each = enumerate(gathered.parts)
+    told = tuple(_told(part, i, rho, keeps, late.get(i), shrunk.get(i)) for i, part in each)
     return Relaxed(told, rho.shape[1], gathered.way)
 
 
@@ -81,19 +106,18 @@ def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints 
     )
 
 
-def _told(part: Formula, i: int, rho: Floats, keeps: Bools, late: Late | None) -> Conjunct:
-    """rho, keeps [conjuncts, futures]."""
+def _told(
+    part: Formula, i: int, rho: Floats, keeps: Bools, late: Late | None, shrunk: Smaller | None
+) -> Conjunct:
+    """rho, keeps [conjuncts, futures]. A future for another conjunct may show only now that this one can be
+    kept alone: what was found to be enough for that is no longer told then.
+    """
     beside = np.delete(keeps, i, axis=0).all(axis=0)
     alone = bool(keeps[i].any())
     highest = float(rho[i][beside].max() if alone and beside.any() else rho[i].max())
-    return Conjunct(part, alone, highest, *(late or (None, False)))
-
-
-class Late(NamedTuple):
-    """By how many steps a window would have to end later; whether that is all that the whole rule lacks."""
-
-    steps: int
-    only: bool
+    late = late if late and (late.only or not alone) else None
+    shrunk = shrunk if shrunk and (shrunk.only or not alone) else None
+    return Conjunct(part, alone, highest, late, shrunk)
 
 
 @dataclass
@@ -133,60 +157,106 @@ class _Searched:
     known: Known
     ground: Ground
     probes: int = MOST_PROBED  # poses that may still be looked at for later ends of windows
+    longest: int = MAX_HORIZON  # horizon of a rule [steps]
     looked_at: int = 0  # by the last search
 
-    def way(self, formula: Formula, most: int = MOST_NODES) -> Ints | None:
+    def way(self, formula: Formula, most: int = MOST_NODES, regions: Regions = NO_REGIONS) -> Ints | None:
         """Motions from x_t to the formula's horizon that satisfy it, if a search finds some. most: poses that
-        it looks at.
+        it looks at. regions: that take the place of the task's.
         """
-        task = replace(self.shield.task, formula=formula)
-        found, self.looked_at = search(replace(self.known, task=task), self.ground, self.shield.body, most)
-        if found is None:
+        task, ground = replace(self.shield.task, formula=formula), self.ground
+        if regions:
+            task = replace(task, regions={**task.regions, **regions})
+            ground = replace(ground, task=task, kept={})
+        found, self.looked_at = search(replace(self.known, task=task), ground, self.shield.body, most)
+        return found if found is not None and self.keeps(found, task) else None
+
+    def keeps(self, motions: Ints, task: Task) -> bool:
+        """Whether motions [m] from x_t satisfy the task's formula."""
+        poses = driven(self.shield, self.known.history, motions[None])
+        return float(values_of(task.formula, task.samples(poses, self.known.signals))[0]) > SATISFIED_ABOVE
+
+    def probe(self, formula: Formula, regions: Regions = NO_REGIONS) -> Ints | None:
+        """`way`, as long as some of `probes` are left."""
+        if self.probes <= 0:
             return None
-        poses = driven(self.shield, self.known.history, found[None])
-        rho = values_of(formula, self.shield.task.samples(poses, self.known.signals))
-        return found if float(rho[0]) > SATISFIED_ABOVE else None
+        way = self.way(formula, min(self.probes, PROBE), regions)
+        self.probes -= self.looked_at
+        return way
 
     def soonest(self, parts: Sequence[Formula], i: int) -> tuple[int, Ints] | None:
         """By how many steps, at least, the window of part i has to end later for a search to find a way that
         keeps all parts; and the way. So the same search finds that way if that rule is asked for.
         """
-
-        def found(late: int) -> Ints | None:
-            if self.probes <= 0:
-                return None
-            way = self.way(_eased(parts, i, late), min(self.probes, PROBE))
-            self.probes -= self.looked_at
-            return way
-
-        most, low, high, best = _most_late(parts[i]), 0, 1, None
+        most, low, high, best = _most_late(parts[i], self.longest), 0, 1, None
         while best is None and low < most:
             high = min(high, most)
-            best = found(high)
+            best = self.probe(_eased(parts, i, high))
             low, high = (low, high) if best is not None else (high, 2 * high)
         while best is not None and high - low > 1:
             middle = (low + high) // 2
-            way = found(middle)
+            way = self.probe(_eased(parts, i, middle))
             low, high, best = (middle, high, best) if way is None else (low, middle, way)
         return None if best is None else (high, best)
 
+    def smallest(self, parts: Sequence[Formula], i: int) -> tuple[Smaller, Ints] | None:
+        """By how much, at least, the regions that part i keeps out of have to be smaller, as `soonest`."""
+        task, formula = replace(self.shield.task, formula=all_of(parts)), all_of(parts)
+        out = {name: most_steps(task.regions[name]) for name in kept_out(parts[i], task.regions)}
+        most = {name: steps for name, steps in out.items() if steps > 0}
 
-def _most_late(part: Formula) -> int:
+        def at(steps: int, names: Iterable[str]) -> dict[str, Region]:
+            found = {name: smaller(task.regions[name], min(steps, most[name])) for name in names}
+            return {name: region for name, region in found.items() if region is not None}
+
+        def enough(way: Ints, low: int, high: int) -> int:
+            """With how few steps a way that keeps all parts with `high` steps does so, more than `low`."""
+            while high - low > 1:
+                middle = (low + high) // 2
+                keeps = self.keeps(way, replace(task, regions={**task.regions, **at(middle, most)}))
+                low, high = (low, middle) if keeps else (middle, high)
+            return high
+
+        low, high = 0, max(most.values(), default=0)
+        best = self.probe(formula, at(high, most)) if high else None
+        tried = 0 if best is None else enough(best, 0, high)
+        while best is not None and high - low > 1:
+            tried = tried if low < tried < high else (low + high) // 2
+            way = self.probe(formula, at(tried, most))
+            if way is None:
+                low = tried
+            else:
+                high, best = tried, way
+                tried = enough(way, low, high)
+        if best is None:
+            return None
+        sizes = {each: {**task.regions, **at(high, most.keys() - {each})} for each in most}
+        needed = [each for each in most if not self.keeps(best, replace(task, regions=sizes[each]))]
+        alone = self.probe(formula, at(high, needed)) if 0 < len(needed) < len(most) else None
+        if alone is None:
+            needed, alone = list(most), best
+        return Smaller(round(high * STEP, 2), at(high, needed), True), alone
+
+
+def _most_late(part: Formula, longest: int) -> int:
     """By how many steps a window is tried to end later, or that of a G over a predicate to begin later."""
     begins = isinstance(part, Always) and is_predicate(part.child)
-    return part.b - part.a if isinstance(part, Always) and begins else MOST_LATE
+    return part.b - part.a if isinstance(part, Always) and begins else min(MOST_LATE, longest - part.horizon)
 
 
-def _gather(gathered: _Gathered) -> dict[int, Late]:
+def _gather(gathered: _Gathered, longest: int) -> tuple[dict[int, Late], dict[int, Smaller]]:
     """Judges the policies' futures, then, as far as these leave it open, searches for the whole rule, for
-    each conjunct alone, which the policies are asked for too, and for a later end of each conjunct's window.
+    each conjunct alone, which the policies are asked for too, for a later end of each conjunct's window, and
+    for smaller regions of each keep-out.
     """
-    shield, known, parts, late = gathered.shield, gathered.known, gathered.parts, dict[int, Late]()
+    shield, known, parts = gathered.shield, gathered.known, gathered.parts
+    late, shrunk = dict[int, Late](), dict[int, Smaller]()
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
     if prefix.steps > 0:
         gathered.judge(futures(prefix, shield.body, shield.proposers, None, (0.0,)).motions)
     gathered.judge(np.full((1, max(prefix.steps, 1)), calmest_motion(shield.body)))
-    searched = _Searched(shield, known, make_ground(shield.task, shield.body, known.held))
+    ground = make_ground(shield.task, shield.body, known.held)
+    searched = _Searched(shield, known, ground, longest=longest)
 
     def look_for(formula: Formula) -> None:
         if (found := searched.way(formula)) is not None:
@@ -195,7 +265,7 @@ def _gather(gathered: _Gathered) -> dict[int, Late]:
     if gathered.way is None:
         look_for(shield.task.formula)
     if gathered.way is not None:
-        return late
+        return late, shrunk
     some = range(min(len(parts), MOST_CONJUNCTS))
     able = [policy for policy in shield.proposers if hasattr(policy, "giving_up")]
     samples = shield.task.samples(known.history, known.signals)
@@ -208,17 +278,26 @@ def _gather(gathered: _Gathered) -> dict[int, Late]:
             asked = [adapted(policy, "giving_up", others) for policy in able]
             gathered.judge(futures(prefix, shield.body, asked, None, (0.0,)).motions)
     alone = [gathered.kept(i) for i in range(len(parts))]
+    whole = all(alone) or len(parts) == 1
     for i in some:
-        if timed[i] and (all(alone) or not alone[i]):
-            found = searched.soonest(parts, i) if all(alone) else searched.soonest(parts[i : i + 1], 0)
+        if timed[i] and (whole or not alone[i]):
+            found = searched.soonest(*((parts, i) if whole else (parts[i : i + 1], 0)))
             if found is not None:
                 steps, motions = found
-                whole = all(alone) or len(parts) == 1 or searched.way(_eased(parts, i, steps)) is not None
-                late[i] = Late(steps, whole)
+                late[i] = Late(steps, whole or searched.way(_eased(parts, i, steps)) is not None)
                 gathered.judge(motions[None])
         elif all(alone) and len(parts) > 1:
             look_for(all_of([other for other in parts if other != parts[i]]))
-    return late
+    searched.probes = MOST_PROBED
+    for i in some:
+        if whole or not alone[i]:
+            least = searched.smallest(*((parts, i) if whole else (parts[i : i + 1], 0)))
+            if least is not None:
+                less, motions = least
+                only = whole or searched.way(shield.task.formula, regions=less.regions) is not None
+                shrunk[i] = less._replace(only=only)
+                gathered.judge(motions[None])
+    return late, shrunk
 
 
 def _eased(parts: Sequence[Formula], i: int, late: int) -> Formula:

@@ -14,8 +14,8 @@ from fastapi import FastAPI
 from specshield.errors import tree
 from specshield.service import problems
 from specshield.service.middleware import guarded
-from specshield.service.schemas.base import Problem
 from specshield.service.schemas.policies import PolicyRequest
+from specshield.service.schemas.problems import Problem
 from specshield.service.schemas.specs import SpecRequest
 from specshield.service.state import problem_documents
 

@@ -98,7 +98,8 @@ class Sessions:
             told = "the rule ends after the last step that a session can have"
             raise InputError(told, path="policy_id", got=f"step {last}", expected=f"at most step {most}")
         ids = [record.id for record in found]
-        asked = request, settings, preference, key.name
+        longest = min(self._settings.max_horizon, self._settings.max_steps)
+        asked = request, settings, preference, key.name, longest
         try:  # in another process where the policies' decisions take long, else in a thread
             if preference is None and await self._run(self._shields.slow_policies, ids):
                 rule, state, rows = await self._heavy.decide(begin, *asked, session=",".join(ids), key=ids)
@@ -259,13 +260,20 @@ class Sessions:
 
 
 def begin(
-    shields: Shields, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
+    shields: Shields,
+    request: SessionRequest,
+    settings: Config,
+    preference: Preference | None,
+    owner: str,
+    longest: int,
 ) -> Begun:
-    """Checks that a session can begin, and makes what is stored of it. preference: for `request.shaping`."""
+    """Checks that a session can begin, and makes what is stored of it. preference: for `request.shaping`.
+    longest: the longest horizon that a rule may have [steps].
+    """
     records = [shields.policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
-    feasible, way = refusal.begin(shield, request.initial_pose, request.allow_infeasible)
+    feasible, way = refusal.begin(shield, request.initial_pose, request.allow_infeasible, longest)
     task, about = shield.task, records[0].about
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])

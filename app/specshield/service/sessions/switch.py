@@ -32,7 +32,7 @@ class Switches:
     def __init__(self, store: Store, shields: Shields, run: Run, heavy: Heavy, settings: Settings) -> None:
         self._store, self._policies, self._shields = store, shields.policies, shields
         self._run, self._heavy = run, heavy
-        self._ttl, self._most = settings.session_ttl, settings.max_steps
+        self._ttl, self._longest = settings.session_ttl, (settings.max_steps, settings.max_horizon)
 
     async def make(self, id: str, request: SwitchRequest, owner: str) -> dict[str, Any]:
         """Makes a switch and returns the session's description. Raises NotFound, InfeasibleSwitch, PoseError,
@@ -66,11 +66,11 @@ class Switches:
         session, ids = wanted.session, wanted.policy_ids
         shaping = session.rule.shaping
         if shaping == PROJECTION and await self._run(self._shields.slow_policies, ids):
-            asked = switched, wanted, self._most
+            asked = switched, wanted, *self._longest
             return await self._heavy.decide(*asked, session=session.id, key=ids)
         if shaping != PROJECTION:
             await self._shields.prepared(self._run, shaping, ids, wanted.row[:3].tolist(), owner)
-        here: Session = await self._run(switched, self._shields, wanted, self._most)
+        here: Session = await self._run(switched, self._shields, wanted, *self._longest)
         return here
 
 
@@ -134,14 +134,16 @@ def _foreseen(session: Session, step: bytes) -> Sequence[float]:
     return session.rows[-1, :3].tolist() if action is None else answer.next_poses[action]
 
 
-def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
-    """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError, StoreError."""
+def switched(shields: Shields, wanted: Wanted, most_steps: int, longest: int) -> Session:
+    """The session under its new rule. most_steps: that a session may have; longest: the longest horizon of a
+    rule [steps]. Raises PoseError, InfeasibleSwitch, InputError, StoreError.
+    """
     session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.rule
     about = shields.policies.record(wanted.policy_ids[0]).about
     task = shields.get(wanted.policy_ids, Config()).task
     origin = t if wanted.clock == "restart" else old.origin
-    last = origin + task.horizon + 1
-    if last > max(most_steps, old.max_steps):
+    last, most_steps = origin + task.horizon + 1, max(most_steps, old.max_steps)
+    if last > most_steps:
         told = "the rule ends after the last step that a session can have"
         expected = f"at most step {most_steps}"
         raise InputError(told, path="policy_id", got=f"step {last}", expected=expected)
@@ -177,7 +179,8 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
     elsewhere = (old.map_id, old.robot) != (rule.map_id, rule.robot)
-    way = refusal.switch(shield, seen[:, :3], rules.signals_in(seen, names), known, elsewhere)
+    longest = min(longest, most_steps - origin - 1)
+    way = refusal.switch(shield, seen[:, :3], rules.signals_in(seen, names), known, elsewhere, longest)
     rule = msgspec.structs.replace(rule, way=(way or b"").hex())
     rows = made.since
     status = episode.close(shield, rows[:, :3], rules.signals_in(rows, names))[0] if len(rows) else "pending"
