@@ -7,7 +7,7 @@ some future.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -31,8 +31,6 @@ from specshield.world.regions import Region
 
 MOST_LATE = 150  # [steps] the most by which a window is tried to end later. Chosen by hand
 MOST_PROBED, PROBE = 100_000, 20_000  # poses in searches for later ends: in all, and in one. By hand
-Regions = Mapping[str, Region]
-NO_REGIONS: Regions = {}
 MOST_CONJUNCTS = 8  # that are searched for; further ones are judged by the policies' futures alone
 
 
@@ -101,9 +99,7 @@ def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints 
     known = Known(shield.task, history, signals)
     if not shield.task.formula.names:  # as in `relaxations`
         return None
-    return _Searched(shield, known, make_ground(shield.task, shield.body, known.held)).way(
-        shield.task.formula
-    )
+    return _Searched(shield, known, make_ground(shield.task, shield.body, known.held)).way(shield.task)
 
 
 def _told(
@@ -160,13 +156,15 @@ class _Searched:
     longest: int = MAX_HORIZON  # horizon of a rule [steps]
     looked_at: int = 0  # by the last search
 
-    def way(self, formula: Formula, most: int = MOST_NODES, regions: Regions = NO_REGIONS) -> Ints | None:
-        """Motions from x_t to the formula's horizon that satisfy it, if a search finds some. most: poses that
-        it looks at. regions: that take the place of the task's.
-        """
-        task, ground = replace(self.shield.task, formula=formula), self.ground
-        if regions:
-            task = replace(task, regions={**task.regions, **regions})
+    def task(self, formula: Formula, regions: Mapping[str, Region] | None = None) -> Task:
+        """The task with another formula, and with some other regions."""
+        task = self.shield.task
+        return replace(task, formula=formula, regions={**task.regions, **(regions or {})})
+
+    def way(self, task: Task, most: int = MOST_NODES) -> Ints | None:
+        """Motions from x_t to the task's horizon that keep it, if a search of some `most` poses finds any."""
+        ground = self.ground
+        if task.regions != ground.task.regions:
             ground = replace(ground, task=task, kept={})
         found, self.looked_at = search(replace(self.known, task=task), ground, self.shield.body, most)
         return found if found is not None and self.keeps(found, task) else None
@@ -176,66 +174,63 @@ class _Searched:
         poses = driven(self.shield, self.known.history, motions[None])
         return float(values_of(task.formula, task.samples(poses, self.known.signals))[0]) > SATISFIED_ABOVE
 
-    def probe(self, formula: Formula, regions: Regions = NO_REGIONS) -> Ints | None:
+    def probe(self, task: Task) -> Ints | None:
         """`way`, as long as some of `probes` are left."""
         if self.probes <= 0:
             return None
-        way = self.way(formula, min(self.probes, PROBE), regions)
+        way = self.way(task, min(self.probes, PROBE))
         self.probes -= self.looked_at
         return way
 
-    def soonest(self, parts: Sequence[Formula], i: int) -> tuple[int, Ints] | None:
-        """By how many steps, at least, the window of part i has to end later for a search to find a way that
-        keeps all parts; and the way. So the same search finds that way if that rule is asked for.
+    def least(self, first: int, most: int, change: Callable[[int], Task]) -> tuple[int, Ints] | None:
+        """The least change, of 1 to `most` steps, for which the search finds a way that keeps the task that
+        it makes; and the way. So the same search finds it if that task is asked for. first: of all tries.
         """
-        most, low, high, best = _most_late(parts[i], self.longest), 0, 1, None
+        low, high, best = 0, first, None
         while best is None and low < most:
             high = min(high, most)
-            best = self.probe(_eased(parts, i, high))
+            best = self.probe(change(high))
             low, high = (low, high) if best is not None else (high, 2 * high)
         while best is not None and high - low > 1:
-            middle = (low + high) // 2
-            way = self.probe(_eased(parts, i, middle))
-            low, high, best = (middle, high, best) if way is None else (low, middle, way)
+            tried, under = low, high  # the way may do with a smaller change
+            while under - tried > 1:
+                middle = (tried + under) // 2
+                tried, under = (tried, middle) if self.keeps(best, change(middle)) else (middle, under)
+            tried = under if under < high else (low + high) // 2
+            way = self.probe(change(tried))
+            low, high, best = (tried, high, best) if way is None else (low, tried, way)
         return None if best is None else (high, best)
 
+    def soonest(self, parts: Sequence[Formula], i: int) -> tuple[int, Ints] | None:
+        """By how many steps, at least, the window of part i has to end later for all parts to be kept."""
+        return self.least(
+            1, _most_late(parts[i], self.longest), lambda late: self.task(_eased(parts, i, late))
+        )
+
     def smallest(self, parts: Sequence[Formula], i: int) -> tuple[Smaller, Ints] | None:
-        """By how much, at least, the regions that part i keeps out of have to be smaller, as `soonest`."""
-        task, formula = replace(self.shield.task, formula=all_of(parts)), all_of(parts)
-        out = {name: most_steps(task.regions[name]) for name in kept_out(parts[i], task.regions)}
+        """By how much, at least, the regions that part i keeps out of have to be smaller for the same. Those
+        that do not matter stay as they are.
+        """
+        regions = self.shield.task.regions
+        out = {name: most_steps(regions[name]) for name in kept_out(parts[i], regions)}
         most = {name: steps for name, steps in out.items() if steps > 0}
 
         def at(steps: int, names: Iterable[str]) -> dict[str, Region]:
-            found = {name: smaller(task.regions[name], min(steps, most[name])) for name in names}
+            found = {name: smaller(regions[name], min(steps, most[name])) for name in names}
             return {name: region for name, region in found.items() if region is not None}
 
-        def enough(way: Ints, low: int, high: int) -> int:
-            """With how few steps a way that keeps all parts with `high` steps does so, more than `low`."""
-            while high - low > 1:
-                middle = (low + high) // 2
-                keeps = self.keeps(way, replace(task, regions={**task.regions, **at(middle, most)}))
-                low, high = (low, middle) if keeps else (middle, high)
-            return high
+        def changed(steps: int, names: Iterable[str] = most) -> Task:
+            return self.task(all_of(parts), at(steps, names))
 
-        low, high = 0, max(most.values(), default=0)
-        best = self.probe(formula, at(high, most)) if high else None
-        tried = 0 if best is None else enough(best, 0, high)
-        while best is not None and high - low > 1:
-            tried = tried if low < tried < high else (low + high) // 2
-            way = self.probe(formula, at(tried, most))
-            if way is None:
-                low = tried
-            else:
-                high, best = tried, way
-                tried = enough(way, low, high)
-        if best is None:
+        largest = max(most.values(), default=0)
+        found = self.least(largest, largest, changed)
+        if found is None:
             return None
-        sizes = {each: {**task.regions, **at(high, most.keys() - {each})} for each in most}
-        needed = [each for each in most if not self.keeps(best, replace(task, regions=sizes[each]))]
-        alone = self.probe(formula, at(high, needed)) if 0 < len(needed) < len(most) else None
-        if alone is None:
-            needed, alone = list(most), best
-        return Smaller(round(high * STEP, 2), at(high, needed), True), alone
+        steps, way = found
+        needed = [each for each in most if not self.keeps(way, changed(steps, most.keys() - {each}))]
+        alone = self.probe(changed(steps, needed)) if 0 < len(needed) < len(most) else None
+        names, way = (most, way) if alone is None else (needed, alone)
+        return Smaller(round(steps * STEP, 2), at(steps, names), True), way
 
 
 def _most_late(part: Formula, longest: int) -> int:
@@ -259,7 +254,7 @@ def _gather(gathered: _Gathered, longest: int) -> tuple[dict[int, Late], dict[in
     searched = _Searched(shield, known, ground, longest=longest)
 
     def look_for(formula: Formula) -> None:
-        if (found := searched.way(formula)) is not None:
+        if (found := searched.way(searched.task(formula))) is not None:
             gathered.judge(found[None])
 
     if gathered.way is None:
@@ -284,7 +279,9 @@ def _gather(gathered: _Gathered, longest: int) -> tuple[dict[int, Late], dict[in
             found = searched.soonest(*((parts, i) if whole else (parts[i : i + 1], 0)))
             if found is not None:
                 steps, motions = found
-                late[i] = Late(steps, whole or searched.way(_eased(parts, i, steps)) is not None)
+                late[i] = Late(
+                    steps, whole or searched.way(searched.task(_eased(parts, i, steps))) is not None
+                )
                 gathered.judge(motions[None])
         elif all(alone) and len(parts) > 1:
             look_for(all_of([other for other in parts if other != parts[i]]))
@@ -294,7 +291,7 @@ def _gather(gathered: _Gathered, longest: int) -> tuple[dict[int, Late], dict[in
             least = searched.smallest(*((parts, i) if whole else (parts[i : i + 1], 0)))
             if least is not None:
                 less, motions = least
-                only = whole or searched.way(shield.task.formula, regions=less.regions) is not None
+                only = whole or searched.way(searched.task(shield.task.formula, less.regions)) is not None
                 shrunk[i] = less._replace(only=only)
                 gathered.judge(motions[None])
     return late, shrunk
