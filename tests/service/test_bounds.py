@@ -65,9 +65,22 @@ def _answer(connection: socket.socket) -> tuple[int, dict[str, Any]]:
 
 def test_a_head_that_is_too_large_is_refused(small: RunningServer) -> None:
     with _connect(small) as connection:
-        connection.sendall(b"GET /livez HTTP/1.1\r\nX-Large: " + b"a" * 20_000 + b"\r\n\r\n")
+        connection.sendall(b"GET /livez HTTP/1.1\r\nX-Large: " + b"a" * 5_000 + b"\r\n\r\n")
         status, problem = _answer(connection)
     assert (status, problem["type"], problem["limit"]) == (431, "headers-too-large", 4096)
+
+
+def test_what_comes_with_the_end_of_a_head_is_not_taken_for_a_part_of_it(small: RunningServer) -> None:
+    """As in a network that delivers the head's beginning first: a step was refused for its body."""
+    body = b'{"formula": "F[0,5] x > 0", "more": "' + b"a" * 5_000 + b'"}'
+    head = f"POST /v1/specs/validate HTTP/1.1\r\nHost: {urlsplit(small.url).netloc}\r\nConnection: close\r\n"
+    head += f"Content-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+    with _connect(small) as connection:
+        for piece in (head[:40].encode(), head[40:].encode() + body):
+            connection.sendall(piece)
+            time.sleep(0.1)
+        status, problem = _answer(connection)
+    assert (status, problem["path"]) == (422, "more")
 
 
 def test_a_head_that_never_ends_is_refused_while_it_comes(small: RunningServer) -> None:

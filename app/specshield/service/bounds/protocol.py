@@ -61,7 +61,9 @@ class BoundedProtocol(HttpToolsProtocol):
     waiting: dict[BoundedProtocol | BoundedStream, None] = {}  # noqa: RUF012
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        self._head, self._most = 0, _settings().max_header_bytes
+        # [bytes] of the head that is being read: of its pieces so far, and of its fields
+        self._head = self._named = 0
+        self._most = _settings().max_header_bytes
         self._in_head = self._upgraded = self._again = False
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
@@ -84,34 +86,32 @@ class BoundedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        if self._in_head:  # `on_header` counts a head that came in one piece
-            self._head += len(data)
-            if self._head > self._most:
-                self._refuse_head()
-                return
+        self._head += len(data) if self._in_head else 0
         self._left: list[bytes | memoryview] = [data]
         while self._left and not self.transport.is_closing():
             self._fed = self._left.pop()
             super().data_received(self._fed)  # type: ignore[arg-type]
         self._fed = b""  # keeps nothing of a body for as long as the connection idles
+        if self._head > self._most and not self.transport.is_closing():  # and has not ended yet
+            self._refuse_head()
         idle = self.cycle is None or self.cycle.response_complete
         if self._late is None and (self._in_head or idle) and not self._upgraded:
             self._expect_head()
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
-        self._in_head, self._head = True, 0
+        self._in_head, self._head, self._named = True, 0, 0
 
     def on_header(self, name: bytes, value: bytes) -> None:
         if not self._in_head:  # a trailer: uvicorn would add it to the headers, which may be read already
             return
-        self._head += len(name) + len(value)
-        if self._head > 2 * self._most:  # `data_received` may have counted the same bytes
+        self._named += len(name) + len(value)
+        if self._named > self._most:
             raise ValueError("the head is too large")  # ends the parsing: uvicorn calls `send_400_response`
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        self._in_head = False
+        self._in_head, self._head = False, 0
         asks = self.parser.should_upgrade() and any(name == b"upgrade" for name, _ in self.headers)
         self._again = asks and not self._should_upgrade()
         if self._again:
@@ -148,7 +148,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self._refuse(InputError("the request cannot open a WebSocket", expected=expected))
 
     def send_400_response(self, msg: str) -> None:
-        if self._in_head and self._head > self._most:
+        if self._in_head and self._named > self._most:
             self._refuse_head()
         else:
             super().send_400_response(msg)
