@@ -16,8 +16,9 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.lateness import driven
 from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations, way
-from specshield.reasons.smaller import STEP, most_steps, smaller
+from specshield.reasons.smaller import STEP, kept_out, most_steps, smaller
 from specshield.robot import robot_from_json
+from specshield.stl import parse
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Circle, Polygon, Rectangle, Union, signed_distance
@@ -151,6 +152,23 @@ def test_a_smaller_region_is_the_points_so_deep_in_it():
     assert smaller(parts, 3) == Union((Circle((0.0, 0.0), 0.025), Rectangle((1.03, 1.03), (2.97, 1.97))))
     assert smaller(parts, 40) == Union((Rectangle((1.4, 1.4), (2.6, 1.6)),))
     assert (most_steps(parts), smaller(parts, 50)) == (49, None)
+
+
+@pytest.mark.parametrize(
+    ("part", "names"),
+    [
+        ("G[0,9] not (touches(K) or L or x > 2 and K)", ("K", "L")),
+        ("G[0,9] (not inside(L) and battery > 1)", ("L",)),
+        ("not K U[0,9] L", ("K",)),
+        ("not L", ("L",)),
+        ("G[0,9] (L -> not K)", ()),
+        ("G[0,9] K", ()),
+        ("F[0,9] not K", ()),
+        ("G[0,9] F[0,3] not K", ()),
+    ],
+)
+def test_what_a_part_of_a_rule_keeps_out_of(part, names):
+    assert kept_out(parse(part), {name: Circle((0.0, 0.0), 1.0) for name in "KL"}) == names
 
 
 def test_how_late_an_until_and_a_place_to_be_in_come():

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from specshield.errors import MapError
-from specshield.stl import Always, Atom, Formula, Not, conjuncts, region_named
+from specshield.stl import Always, Atom, Formula, Not, Until, conjuncts, region_named
 from specshield.stl.conjunction import is_predicate
 from specshield.world.regions import Circle, Polygon, Rectangle, Region, Union, signed_distance
 
@@ -18,10 +18,11 @@ PARALLEL = 1e-9  # two edges whose directions have a smaller cross product
 
 
 def kept_out(part: Formula, regions: Mapping[str, Region]) -> tuple[str, ...]:
-    """The regions that a conjunct `G[a,b] not R`, with several of them too, keeps the robot out of."""
-    if not isinstance(part, Always) or not is_predicate(part.child):
-        return ()
-    barred = [each.child for each in conjuncts(part.child) if isinstance(each, Not)]
+    """The regions that a conjunct keeps the robot out of: `G[a,b] not R`, `not R U[a,b] p`, or `not R` alone,
+    with several of them too.
+    """
+    asked = part.child if isinstance(part, Always) else part.left if isinstance(part, Until) else part
+    barred = [each.child for each in conjuncts(asked) if isinstance(each, Not)] if is_predicate(asked) else []
     names = (region_named(each.name)[1] for each in barred if isinstance(each, Atom))
     return tuple(dict.fromkeys(name for name in names if name in regions))
 
