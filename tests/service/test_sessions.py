@@ -210,6 +210,9 @@ def test_a_refused_start_says_whether_that_is_proved_and_what_is_wrong_with_each
     goal, battery = refused["conjuncts"]
     assert (goal["formula"], goal["feasible_alone"]) == ("F[0,6] Goal", False)
     assert goal["robustness"] < 0.0 < goal["late_by"]
+    short = {**body, "max_steps": 6 + goal["late_by"] - 1}  # the session would end before the later end
+    refused = problem(client.post("/v1/sessions", json=short), 422, "infeasible-start")
+    assert refused["conjuncts"][0]["late_by"] is None
     assert (battery["formula"], battery["feasible_alone"], battery["late_by"]) == (
         "G[0,8] battery > 10",
         True,

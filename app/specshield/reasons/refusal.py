@@ -174,7 +174,7 @@ def _ways(conjuncts: Sequence[Conjunct]) -> str:
 
 def _eased(conjunct: Conjunct) -> Iterator[str]:
     if (late := conjunct.late) and late.only:
-        yield f"'{str(later(conjunct.formula, late.steps))[:LONGEST]}' in place of '{_shown(conjunct)}'"
+        yield f"'{str(later(conjunct.formula, late.steps))[:LONGEST]}' instead"
     if (less := conjunct.smaller) and less.only:
         yield f"{' and '.join(less.regions)[:LONGEST]} smaller by {less.by:.2f} m all round"
 
