@@ -21,6 +21,13 @@ settings.load_profile("busy")
 gc.disable()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Those of one module wait for nearly two minutes, for stores that do not answer. If they began late, all
+    others would have ended before.
+    """
+    items.sort(key=lambda item: item.path.name != "test_stores.py")
+
+
 def pytest_collection_finish() -> None:
     """What was imported stays: without this, each full collection looks at a million objects again."""
     gc.freeze()

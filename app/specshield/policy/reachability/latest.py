@@ -266,18 +266,16 @@ def _finds_ways(boxed: Boxed[Guide], width: int, late: float, poses: Floats, sta
     tables, horizon, motions = guide.tables, guide.tables.end[-1], motion_count(guide.body)
     scratch, every = make_scratch(guide.rules, motions), 1 + (motions - 1) // MAX_SCORED
     tried, found = 0, 0
-    here, run = np.empty((1, 3)), np.zeros((1, status.shape[1]), np.int64)
+    run = np.zeros((1, status.shape[1]), np.int64)
     terms = Terms(width, late - 1.0, np.inf, every)
     for n in range(poses.shape[0]):
-        for k in range(3):
-            here[0, k] = poses[n, k]
         copy_progress(status[n], run[0], scratch.status, scratch.run)
         start = 0
         for end in tables.end:
-            ahead = slack(guide, here[0, 0], here[0, 1], here[0, 2], start, scratch)
+            ahead = slack(guide, poses[n, 0], poses[n, 1], poses[n, 2], start, scratch)
             t = start + int(np.floor(ahead - late)) + 1
             if start <= t <= end and t < horizon:
-                own = status[n : n + 1]
+                here, own = poses[n : n + 1], status[n : n + 1]
                 _, taken = beam_search(guide, t, here, own, run, horizon - t, terms, scratch)
                 tried, found = tried + 1, found + (taken[0] > 0)
                 break
