@@ -18,7 +18,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Futures, Prefix, futures, together
 from specshield.shield.proposal import adapted
 from specshield.stl import Formula
-from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
+from specshield.world.learned import BEHIND, BEYOND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 BESIDE_WALLS = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
@@ -26,6 +26,9 @@ AGAIN = 0.2  # [m] from what was touched before; what is nearer may be the same 
 SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
+# [steps] With less slack than this, an obstacle is not taken to be large, if that leaves more. With 8, fewer
+# runs were kept. Chosen by hand.
+ENOUGH = 4
 MOST_PARTS = 4  # parts of the rule, which no way keeps together, that are tried one by one; chosen by hand
 
 
@@ -39,12 +42,18 @@ def tried_again(
 
     told: the shield on the policy's map; judged: by the map as marked.
     """
+    known, vain, had = taught.map, None, judged.aimed.slack
     if judged.some and not judged.vain:
-        return None
-    vain, now = None, now._replace(care=now.care._replace(guess=True))
-    for guess in doubted(told, taught, now.prefix):
+        large = known.by == BEYOND
+        if not (taught.contact and large.any() and had < min(ENOUGH, now.care.least)):
+            return None
+        guesses = iter([taught._replace(map=revised(known, forget(known, large)))])
+    else:
+        guesses, had = doubted(told, taught, now.prefix), -1
+    now = now._replace(care=now.care._replace(guess=True))
+    for guess in guesses:
         found = judged_by_signals(on_map(told, guess.map, True, taught.barred), now)
-        if found[2].some and not found[2].vain:
+        if found[2].some and not found[2].vain and found[2].aimed.slack > had:
             return guess, found
         if found[2].some and vain is None and not judged.some:
             vain = guess, found
@@ -70,12 +79,13 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE_WALLS
     held = [marked & np.isin(known.by, some) for some in GUESSES]
-    held.insert(1, marked & beside & (known.by != BEHIND))
+    held.insert(1, marked & beside & (known.by < BEHIND))
     newest = marked & (known.step == known.step[marked].max(initial=-1))
-    same, front = np.zeros_like(newest), np.flatnonzero(newest & (known.by != BEHIND))
+    same, front = np.zeros_like(newest), np.flatnonzero(newest & (known.by < BEHIND))
     same[front] = _is_near(told, known.cell[front], known.cell[marked & ~newest])
     if same.any():
         held.insert(1, (marked & ~newest) | same)
+    held.insert(0, marked & (known.by != BEYOND))
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()
