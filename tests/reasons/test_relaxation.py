@@ -402,9 +402,10 @@ def test_a_heading_that_can_be_had_is_feasible_alone():
     [
         ("not (A U[0,4] (F[0,2] D)) and F[0,1] C", [True, False], 9),
         ("G[0,60] (F[20,40] B and F[20,40] A) and F[0,5] C", [False, False], 5),
+        ("F[0,9] B and F[0,5] 1 > 2", [True, False], None),
     ],
 )
-def test_a_rule_of_which_much_or_a_negation_is_left_is_refused_with_its_parts(rule, alone, late):
+def test_a_rule_of_which_much_a_negation_or_a_constant_is_left_is_refused_with_its_parts(rule, alone, late):
     """C is ten motions away. Without a bound on the work for what is left of it, the search for the second
     rule took more than 20 s.
     """

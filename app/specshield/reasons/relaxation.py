@@ -172,7 +172,8 @@ class _Searched:
     def keeps(self, motions: Ints, task: Task) -> bool:
         """Whether motions [m] from x_t satisfy the task's formula."""
         poses = driven(self.shield, self.known.history, motions[None])
-        return float(values_of(task.formula, task.samples(poses, self.known.signals))[0]) > SATISFIED_ABOVE
+        whole = replace(task, formula=self.shield.task.formula)  # a conjunct may read nothing
+        return float(values_of(task.formula, whole.samples(poses, self.known.signals))[0]) > SATISFIED_ABOVE
 
     def probe(self, task: Task) -> Ints | None:
         """`way`, as long as some of `probes` are left."""
