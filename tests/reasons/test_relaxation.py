@@ -148,10 +148,19 @@ def test_a_smaller_region_is_the_points_so_deep_in_it():
                 seen += 1
                 assert inside[depth > STEP * steps + 1e-4].all()
     assert seen > 60
+    outer = (
+        [(0.0, 0.9), (0.5, 0.9), (0.5, 1.5), (1.1, 1.5)],
+        [(1.8, 1.0), (2.7, 1.0), (2.7, -0.4), (0.0, -0.4)],
+    )
+    notched = Polygon((*outer[0], (1.1, 0.3), (1.8, 0.3), *outer[1]))
+    assert smaller(notched, 30) is None  # its corners would be so deep, but an edge would cross the notch
     parts = Union((Circle((0.0, 0.0), 0.055), Rectangle((1.0, 1.0), (3.0, 2.0))))
     assert smaller(parts, 3) == Union((Circle((0.0, 0.0), 0.025), Rectangle((1.03, 1.03), (2.97, 1.97))))
     assert smaller(parts, 40) == Union((Rectangle((1.4, 1.4), (2.6, 1.6)),))
     assert (most_steps(parts), smaller(parts, 50)) == (49, None)
+    rule, many = parse("G[0,6] not (A or B)"), Union((Circle((0.0, 0.0), 1.0),) * 666)
+    assert kept_out(rule, {"A": parts, "B": parts}) == ("A", "B")
+    assert kept_out(rule, {"A": parts, "B": many}) == ()  # they would take long
 
 
 @pytest.mark.parametrize(

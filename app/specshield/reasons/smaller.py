@@ -9,22 +9,33 @@ import numpy as np
 from specshield.errors import MapError
 from specshield.stl import Always, Atom, Formula, Not, Until, conjuncts, region_named
 from specshield.stl.conjunction import is_predicate
-from specshield.world.regions import Circle, Polygon, Rectangle, Region, Union, signed_distance
+from specshield.world.regions import (
+    Area,
+    Circle,
+    Polygon,
+    Rectangle,
+    Region,
+    Union,
+    pack_areas,
+    signed_distance,
+)
 
 STEP = 0.01  # [m] by multiples of which regions are made smaller
 MOST_STEPS = 1_000  # that are tried. Both chosen by hand
+MOST_NUMBERS = 2_000  # that describe the regions of a keep-out: as many as the largest polygon has
 DIGITS = 6  # of coordinates and radii [m]
 PARALLEL = 1e-9  # two edges whose directions have a smaller cross product
 
 
 def kept_out(part: Formula, regions: Mapping[str, Region]) -> tuple[str, ...]:
     """The regions that a conjunct keeps the robot out of: `G[a,b] not R`, `not R U[a,b] p`, or `not R` alone,
-    with several of them too.
+    with several of them too. Empty if to make them smaller would take long.
     """
     asked = part.child if isinstance(part, Always) else part.left if isinstance(part, Until) else part
     barred = [each.child for each in conjuncts(asked) if isinstance(each, Not)] if is_predicate(asked) else []
     names = (region_named(each.name)[1] for each in barred if isinstance(each, Atom))
-    return tuple(dict.fromkeys(name for name in names if name in regions))
+    found = tuple(dict.fromkeys(name for name in names if name in regions))
+    return found if pack_areas([Area(regions[name]) for name in found]).data.size <= MOST_NUMBERS else ()
 
 
 def most_steps(region: Region) -> int:
@@ -76,6 +87,7 @@ def _polygon(polygon: Polygon, by: float) -> Polygon | None:
                 found = Polygon(tuple((round(x, DIGITS), round(y, DIGITS)) for x, y in corners.tolist()))
             except MapError:
                 return None
-            return found if signed_distance(polygon, corners).min() > by - STEP / 10 else None
+            around = signed_distance(polygon, corners), -signed_distance(found, polygon.vertices)
+            return found if min(each.min() for each in around) > by - STEP / 10 else None
         lines = np.delete(lines, int(np.argmin(lengths)), axis=0)
     return None

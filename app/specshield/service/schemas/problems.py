@@ -30,7 +30,9 @@ class ProblemConjunct(BaseModel):
         description="By how much the regions that the part keeps out of (`G[a,b] not R`) would have to be "
         "smaller all round, for the same [m]. Null if no such number was found.",
     )
-    regions: dict[str, Region] | None = Field(None, description="These regions, made smaller by that.")
+    regions: dict[str, Region] | None = Field(
+        None, description="These regions, each made smaller by that, or by as much as it can be."
+    )
 
 
 class Problem(BaseModel):
