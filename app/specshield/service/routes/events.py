@@ -152,7 +152,7 @@ Places = Annotated[
 async def several(server: ServerState, owner: Owner, session: Places) -> Response:
     """The decisions of several sessions in one stream, as a page needs them to show robots on one floor.
 
-    Sessions that do not exist are left out. The stream ends when all of them are over.
+    Sessions that do not exist or cannot be read are left out. The stream ends when all of them are over.
     """
     asked = (place.partition(":") for place in session)
     after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}
