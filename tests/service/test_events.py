@@ -16,7 +16,7 @@ import httpx
 import pytest
 import redis
 
-from specshield.errors import LimitReached
+from specshield.errors import LimitReached, SessionDamaged
 from specshield.service.routes.sessions import _each
 from specshield.service.sessions import record
 from specshield.service.sessions.session import Session
@@ -352,8 +352,10 @@ def test_an_archived_session_is_read_once_for_a_stream(server, begin, step, monk
 def test_a_session_whose_file_is_damaged_ends_its_streams_and_keeps_no_other_from_its_news(
     server, begin, step
 ):
+    """None has told less than it says: one that lacks decisions breaks off, and its caller asks again."""
     lost, other = begin(), begin()
     id = scoped("", lost["id"])
+    assert step(lost, 0, ahead(0)).status_code == 200
 
     async def watch():
         async with another_server(server) as (store, _):
@@ -362,7 +364,11 @@ def test_a_session_whose_file_is_damaged_ends_its_streams_and_keeps_no_other_fro
             for stream in streams:
                 assert await anext(stream)
             assert await put_away(store, id)
+            behind = await watchers.open(id, -1)
+            assert await anext(behind)
             store.archive._objects.write((await store.file(id)).path, b"damaged")
+            with pytest.raises(SessionDamaged):
+                await anext(behind)
             looking = asyncio.create_task(watchers.run())
             assert b"event: end" in await anext(streams[0])
             assert step(other, 0, ahead(0)).status_code == 200

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import Field
 from starlette.types import Receive, Scope, Send
 
-from specshield.errors import StoreError
+from specshield.errors import SessionDamaged, StoreError
 from specshield.service import examples
 from specshield.service.problems import until_gone
 from specshield.service.routes.sessions import UNREADABLE, PathId, SessionKey
@@ -27,7 +27,9 @@ router = APIRouter(prefix="/v1", tags=["sessions"])
 
 
 class EventStream(Response):
-    """Sends the stream until it ends, the caller's key is refused, the store is away or the caller leaves."""
+    """Sends the stream until it ends, the caller's key is refused, what it tells cannot be read or the caller
+    leaves.
+    """
 
     media_type = EVENTS
 
@@ -44,7 +46,7 @@ class EventStream(Response):
         shown = dict(scope["headers"]).get(b"authorization", b"")
         await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
         async with anyio.create_task_group() as group:
-            with anyio.CancelScope() as reading, suppress(StoreError):
+            with anyio.CancelScope() as reading, suppress(StoreError, SessionDamaged):
                 group.start_soon(end_after, until_gone, receive)
                 group.start_soon(end_after, scope["app"].state.server.keys.until_refused, shown)
                 async for content in self._stream:

@@ -238,7 +238,9 @@ class Watchers:
         known, file = feed.version, await self._store.file(feed.id)
         feed.looked = time.monotonic()
         read = file is not None and file == feed.file  # then nothing is new
-        dump = None if read else await self._dump(feed)
+        dump = None
+        with contextlib.suppress(SessionDamaged):  # as if it was erased
+            dump = None if read else await self._store.dump(feed.id)
         if feed.version != known:  # a step of this process has brought it back meanwhile
             return
         if not read and (dump is None or not feed.rule(Session.of(dump))):
@@ -250,14 +252,10 @@ class Watchers:
             feed.add(state, found, state.next_t, state.next_t)
         feed.version, feed.file = None, file
 
-    async def _dump(self, feed: Feed) -> Dump | None:
-        """The session; None if it was erased, or its file is damaged."""
-        with contextlib.suppress(SessionDamaged):
-            return await self._store.dump(feed.id)
-        return None
-
     async def _since(self, feed: Feed, t: int) -> tuple[list[Told], int]:
-        """Decisions from step t on, and the step that follows them. Older ones are read from the store."""
+        """Decisions from step t on, and the step that follows them. Older ones are read from the store.
+        Raises SessionDamaged.
+        """
         if t >= feed.start:
             return feed.since(t), max(t, feed.end)
         await self._idle()
@@ -268,7 +266,7 @@ class Watchers:
         if new is None:
             dump = self._archived.peek(feed)
             if dump is None or len(dump.steps) <= t:  # it may have been away from the archive in between
-                dump = await self._dump(feed)
+                dump = await self._store.dump(feed.id)
                 if dump is None or not feed.rule(Session.of(dump)):
                     return [], feed.end
                 self._archived.put(feed, dump)
