@@ -37,8 +37,9 @@ def tried_again(
 ) -> tuple[Taught, tuple[Shield, Situation, Judged, bool]] | None:
     """The first guess about the map that leaves a way without motions that led nowhere before, and how the
     actions were judged by it. If there is none and the map as marked leaves no such way either, the map as
-    marked if it leaves one with such motions, else the first guess that does. None if no guess is needed, or
-    none leaves a way.
+    marked if it leaves one with such motions, else the first guess that does. After a contact that leaves
+    less slack than ENOUGH, the usual size of an obstacle is the only guess, if that leaves more. None if no
+    guess is needed, or none is better.
 
     told: the shield on the policy's map; judged: by the map as marked.
     """
@@ -58,7 +59,7 @@ def tried_again(
         if found[2].some and vain is None and not judged.some:
             vain = guess, found
     if not judged.some and len(taught.barred):
-        found = judged_by_signals(on_map(told, taught.map, True), now)
+        found = judged_by_signals(on_map(told, taught.map), now)
         if found[2].some:
             return taught, found
     return vain
@@ -69,9 +70,10 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
 
     What a sensor sees all around the footprint is the robot itself. A motion that stopped short met
     something, but nobody knows where along its front, nor how large it is. So less is believed than is
-    marked: nothing behind what was touched; of the last contact only what lies beside what was touched
-    before, which may be a little larger; only what lies beside the map's own obstacles, which may stand a
-    little elsewhere; only what lies straight ahead; only what lies to the left; only what lies to the right.
+    marked: not that it is large; nothing behind what was touched; of the last contact only what lies beside
+    what was touched before, which may be a little larger; only what lies beside the map's own obstacles,
+    which may stand a little elsewhere; only what lies straight ahead; only what lies to the left; only what
+    lies to the right.
     Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
     Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
     is gone; then cells that no sensor saw again for UNSEEN_AFTER steps. At last, all just passed is free.
