@@ -26,7 +26,7 @@ PAPER = REPOSITORY / "docs" / "architecture.md"  # it names each module of the t
 TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield", "episode")  # what the guarantee rests on
 MOST_TRUSTED = 5_420  # lines of the trusted core
 AIM = 17_000  # lines of app/ that the project wants to come down to
-MOST = 40_350
+MOST = 40_324
 LONGEST = 350  # lines of one module
 FULLEST = 14  # files in one folder, at one level
 

@@ -97,27 +97,6 @@ def test_a_robot_without_sensors_learns_from_what_it_runs_into():
     assert last.map_revision >= 1
 
 
-@pytest.mark.parametrize("y", [0.95, 1.05])
-def test_a_thing_twice_as_wide_as_usual_is_run_into_few_times(y):
-    """There were seven contacts when whatever was touched was taken to be 0.3 m wide at the most."""
-    grid, shield, poses, carry, contacts = (
-        room().task.grid,
-        shield_of(60, learn_map=True),
-        [(0.6, y, 0.0)],
-        None,
-        0,
-    )
-    large = np.all(np.abs(grid.centres - (2.0, 1.0)) <= 0.3, axis=-1)
-    body, decision = make_body(STRETCH, replace(grid, occupied=large)), None
-    while decision is None or decision.spec_status == "pending":
-        decision = decide(shield, poses, None, main_task_done=True, carry=carry)
-        carry, motion = decision.carry, int(STRETCH.motion_of[decision.action])
-        poses.append(step(body, *poses[-1], motion))
-        contacts += poses[-1] != step(shield.body, *poses[-2], motion)
-    assert decision.spec_status == "satisfied"
-    assert contacts <= 3
-
-
 @pytest.mark.parametrize("heading", [0.0, 1.0])
 def test_what_stopped_a_move_that_did_not_begin_is_taken_to_be_half_way(heading):
     """A robot that stays where it is does so wherever on its way the thing stands."""

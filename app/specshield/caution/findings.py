@@ -41,7 +41,7 @@ def findings(told: Shield, shield: Shield, taught: Taught, now: Situation, nexts
     believed = tried_again(told, taught, judged, now)
     if believed is not None:
         if believed[0] is not taught:
-            said.append("no other way or time was left, so what was touched, or seen long ago, is doubted")
+            said.append("no other way was left, so what was touched, or last seen long ago, is doubted")
         taught, (shield, now, judged, withstands) = believed
         nexts = np.empty_like(nexts)
         successors(shield.body, now.prefix.poses[-1], nexts)

@@ -34,7 +34,7 @@ from specshield.caution.surprise.contact import (
     lies_beside,
     moved_on,
 )
-from specshield.caution.surprise.vain import barred_by, did_nothing, halted_at, halts_at, led_nowhere, worked
+from specshield.caution.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.compiled import leaf
 from specshield.robot.dynamics import (
     Body,
@@ -51,7 +51,6 @@ from specshield.shield.feasibility import Prefix
 from specshield.shield.proposal import adapted
 from specshield.world.learned import (
     BEHIND,
-    BEYOND,
     CONTACT,
     NONE,
     SENT,
@@ -134,9 +133,8 @@ def teach(
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)
-        felt = known.cell[known.occupied & (known.by != SENT) & (known.by != BEYOND)]
-        stands = is_near(poses[-2:-1], poses[-1], near)
-        beside = stands and lies_beside(body, felt, poses[-1], drawn)
+        felt = known.cell[known.occupied & (known.by != SENT)]
+        beside = is_near(poses[-2:-1], poses[-1], near) and lies_beside(body, felt, poses[-1], drawn)
         again = beside or halts > 0
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, again)
         if motion >= 0 and followed.met < 2 and not (beside or was_stopped(shield, carry, poses, halts)):
@@ -150,7 +148,7 @@ def teach(
             stuck = did_nothing(stuck, poses[-1], followed.halted)
         elif on >= 0:  # f was wrong there: a way that relies on it again may lead round in a circle
             stuck = led_nowhere(stuck, poses[-2], on, near)
-        elif drawn >= 0 and not stands:
+        elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):
             stuck = worked(stuck, poses[-2], drawn, near)
         half_way = np.empty(3)
         covers = _covers(body, poses[-2], poses[-1], half_way)
@@ -159,15 +157,12 @@ def teach(
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
             driven = poses[here:][np.hypot(*(poses[here:, :2] - poses[-1, :2]).T) <= NEARBY]
-            also = halted_at(stuck, poses[-1], near) if stands else []  # nor were these slips
-            for other in also:
-                stuck = led_nowhere(stuck, poses[-1], other, near)
-            met = [each for one in (motion, *also) for each in cells_met(body, poses[-1], one, driven)]
+            met = cells_met(body, poses[-1], motion, driven)
             if not any(len(cells) for _, cells in met):  # a wrong footprint, or something that moved there
                 met = cells_met(body, poses[-1], motion, poses[-1:])
             for by, cells in met:
                 # Cells along the front were touched, so they replace guesses. A guess replaces nothing.
-                kept = known.cell[known.by < max(by + 1, BEHIND)]
+                kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
                 known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
     beyond, said = 0, list[str]()
     for name, points in (("free", free), ("occupied", occupied)):  # a cell sent as both is occupied

@@ -25,7 +25,7 @@ MAX_POINTS = 2000  # of each kind, in one step
 MAX_CELLS = 100_000  # that differ from the policy's map: 10 x 25 m of 5 cm cells, half a megabyte as bytes
 # What changed a cell: a point that was sent, or a motion that stopped short. A motion marks cells straight
 # ahead, to the left, to the right, and behind these, as far as the obstacle may reach.
-SENT, CONTACT, LEFT, RIGHT, BEHIND, BEYOND = range(6)
+SENT, CONTACT, LEFT, RIGHT, BEHIND = range(5)
 FEW_ROWS = 64  # of new cells: with more of them, a clearance made anew takes as long (measured, 10 x 10 m)
 
 

@@ -19,7 +19,7 @@ from specshield.compiled import kernel
 from specshield.portable import arctan2
 from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, displacements, wrap
-from specshield.world.learned import BEHIND, BEYOND, CONTACT, LEFT, RIGHT
+from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
 Near = tuple[float, float]  # [m], [rad] poses this near may be one, but for noise
 # For a robot of which nothing is known: five times the noise that SPOC's stochastic controller gives a
@@ -28,9 +28,7 @@ NEAR: Near = (0.05, math.radians(2.5))
 
 ARC = math.radians(25.0)  # [rad] to both sides of straight ahead: where a contact is most likely. By hand.
 ASIDE = math.radians(75.0)  # [rad] to both sides: where it may be. Chosen by hand.
-# [m] How wide and deep an obstacle is taken to be that is on no map: the usual one, and one that the robot
-# keeps clear of as long as it has the time. Chosen by hand.
-THING, LARGE = 0.3, 0.6
+THING = 0.3  # [m] how wide and deep an obstacle is taken to be that is on no map; chosen by hand
 UNDER = 0.03  # [m] a cell that the footprint overlaps by more than this is free: three times the noise
 
 
@@ -130,22 +128,20 @@ def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tup
     """The cells, ascending, of what a motion may have run into at a pose (3,), by where they lie.
 
     CONTACT, LEFT and RIGHT lie within a cell's side of the footprint: straight ahead of where its centre
-    goes, which a turn swings, and to both sides of that. BEHIND is the rest of an obstacle of the usual size,
-    and BEYOND that of a large one. Cells that the footprint overlapped at the poses driven [n, 3] are left
-    out. A move of a robot that stays where it is may have met something anywhere along its way, so that is
-    taken to be half way.
+    goes, which a turn swings, and to both sides of that. BEHIND is the rest of an obstacle of the usual size.
+    Cells that the footprint overlapped at the poses driven [n, 3] are left out. A move of a robot that stays
+    where it is may have met something anywhere along its way, so that is taken to be half way.
     """
     if not body.stop:
         half = 0.5 * displacement(body, motion)[0]
         pose = pose + np.array([half * math.cos(pose[2]), half * math.sin(pose[2]), 0.0])
-    cells, gap, bearing = _around(body, pose, LARGE)
+    cells, gap, bearing = _around(body, pose, THING)
     aside = np.remainder(bearing - _direction(body, pose, motion) + math.pi, 2.0 * math.pi) - math.pi
     far = gap + body.radius
     x, y = far * np.cos(aside), far * np.sin(aside)
     rim = (gap > -TOUCH) & (gap <= body.resolution)
-    thing, large = (np.hypot(x - body.radius - 0.5 * size, y) <= 0.5 * size for size in (THING, LARGE))
+    thing = np.hypot(x - body.radius - 0.5 * THING, y) <= 0.5 * THING
     parts = (
-        (BEYOND, large & ~rim & ~thing),
         (BEHIND, thing & ~rim),
         (LEFT, rim & (aside > ARC) & (aside <= ASIDE)),
         (RIGHT, rim & (aside < -ARC) & (aside >= -ASIDE)),

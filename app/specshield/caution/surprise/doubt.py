@@ -18,7 +18,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Futures, Prefix, futures, together
 from specshield.shield.proposal import adapted
 from specshield.stl import Formula
-from specshield.world.learned import BEHIND, BEYOND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
+from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 BESIDE_WALLS = 0.1  # [m] from the map's own obstacles; what is nearer may be a part of them. Chosen by hand
@@ -26,9 +26,6 @@ AGAIN = 0.2  # [m] from what was touched before; what is nearer may be the same 
 SKIN = 0.05  # [m] from the footprint; what is seen nearer, all around, is the robot itself; chosen by hand
 DOUBTED_AFTER = 4  # [steps] after which a contact is doubted if nothing else is left; chosen by hand
 UNSEEN_AFTER = 20  # [steps] the same, for cells that were sent as occupied and not again; chosen by hand
-# [steps] With less slack than this, an obstacle is not taken to be large, if that leaves more. With 8, fewer
-# runs were kept. Chosen by hand.
-ENOUGH = 4
 MOST_PARTS = 4  # parts of the rule, which no way keeps together, that are tried one by one; chosen by hand
 
 
@@ -37,24 +34,17 @@ def tried_again(
 ) -> tuple[Taught, tuple[Shield, Situation, Judged, bool]] | None:
     """The first guess about the map that leaves a way without motions that led nowhere before, and how the
     actions were judged by it. If there is none and the map as marked leaves no such way either, the map as
-    marked if it leaves one with such motions, else the first guess that does. After a contact that leaves
-    less slack than ENOUGH, the usual size of an obstacle is the only guess, if that leaves more. None if no
-    guess is needed, or none is better.
+    marked if it leaves one with such motions, else the first guess that does. None if no guess is needed, or
+    none leaves a way.
 
     told: the shield on the policy's map; judged: by the map as marked.
     """
-    known, vain, had = taught.map, None, judged.aimed.slack
     if judged.some and not judged.vain:
-        large = known.by == BEYOND
-        if not (taught.contact and large.any() and had < min(ENOUGH, now.care.least)):
-            return None
-        guesses = iter([taught._replace(map=revised(known, forget(known, large)))])
-    else:
-        guesses, had = doubted(told, taught, now.prefix), -1
-    now = now._replace(care=now.care._replace(guess=True))
-    for guess in guesses:
+        return None
+    vain, now = None, now._replace(care=now.care._replace(guess=True))
+    for guess in doubted(told, taught, now.prefix):
         found = judged_by_signals(on_map(told, guess.map, True, taught.barred), now)
-        if found[2].some and not found[2].vain and found[2].aimed.slack > had:
+        if found[2].some and not found[2].vain:
             return guess, found
         if found[2].some and vain is None and not judged.some:
             vain = guess, found
@@ -70,10 +60,9 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
 
     What a sensor sees all around the footprint is the robot itself. A motion that stopped short met
     something, but nobody knows where along its front, nor how large it is. So less is believed than is
-    marked: not that it is large; nothing behind what was touched; of the last contact only what lies beside
-    what was touched before, which may be a little larger; only what lies beside the map's own obstacles,
-    which may stand a little elsewhere; only what lies straight ahead; only what lies to the left; only what
-    lies to the right.
+    marked: nothing behind what was touched; of the last contact only what lies beside what was touched
+    before, which may be a little larger; only what lies beside the map's own obstacles, which may stand a
+    little elsewhere; only what lies straight ahead; only what lies to the left; only what lies to the right.
     Each new contact at the same pose shows that the guess before was wrong, so the next one is tried first.
     Then contacts of DOUBTED_AFTER steps ago or earlier are forgotten, since no contact shows that an obstacle
     is gone; then cells that no sensor saw again for UNSEEN_AFTER steps. At last, all just passed is free.
@@ -81,13 +70,12 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, beside = known.occupied & ~sent, told.task.grid.clearance.ravel()[known.cell] <= BESIDE_WALLS
     held = [marked & np.isin(known.by, some) for some in GUESSES]
-    held.insert(1, marked & beside & (known.by < BEHIND))
+    held.insert(1, marked & beside & (known.by != BEHIND))
     newest = marked & (known.step == known.step[marked].max(initial=-1))
-    same, front = np.zeros_like(newest), np.flatnonzero(newest & (known.by < BEHIND))
+    same, front = np.zeros_like(newest), np.flatnonzero(newest & (known.by != BEHIND))
     same[front] = _is_near(told, known.cell[front], known.cell[marked & ~newest])
     if same.any():
         held.insert(1, (marked & ~newest) | same)
-    held.insert(0, marked & (known.by != BEYOND))
     first = max(taught.followed.met - 1, 0) % len(held)
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
     unseen = told.config.learn_map and taught.looks and (old & sent).any()

@@ -29,11 +29,6 @@ def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> i
     return sum(each[3] == ~motion and _is_at(each, pose, near) for each in stuck)
 
 
-def halted_at(stuck: Iterable[Stuck], pose: Floats, near: Near) -> list[int]:
-    """The motions that did nothing at a pose (3,) and may only have slipped."""
-    return sorted({~each[3] for each in stuck if each[3] < 0 and _is_at(each, pose, near)})
-
-
 def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
     """`stuck`, and that a motion leads nowhere from a pose (3,)."""
     return _newest((*worked(stuck, pose, motion, near), (*pose.tolist(), motion)))
