@@ -33,7 +33,7 @@ from specshield.service.storage.keeper import private
 # that the kernels that only some sessions need are there too.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 230  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 70  # [s] of a first start on two quiet cores; 29 to 73 were measured (`make wheels` prints it)
+TAKES = 70  # [s] of a first start on two quiet cores; 19 to 73 were measured (`make wheels` prints it)
 TELL_EVERY = 5.0  # [s] between two lines of the log
 LOW = 10  # niceness of compiling in the background: with 19 it makes no progress beside 8 busy programs
 NEARLY = 1.0  # [s] to wait for readiness before listening; chosen by hand
