@@ -81,17 +81,17 @@ def plan_all(
     held: Floats,
     prefix: Floats,
     effort: float,
-    lost: float,
+    without_plan: float,
     most: int,
     motions: Ints,
 ) -> tuple[int, bool]:
     """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
     takes, and whether there is a plan.
 
-    held (S,): the values that signals keep; prefix (size,): the formula's leaves to step t; effort, lost
-    [about us]: of one plan, and of all searches after first motions as long as there is no plan; most: how
-    many poses a search over exact poses may make. First a plan from x_t is looked for. Each other first
-    motion is undone to go the same way. If that comes too late, a plan after that motion is looked for.
+    held (S,): the values that signals keep; prefix (size,): the formula's leaves to step t; effort [about
+    us]: of one plan; without_plan [about us]: of all searches after first motions while no plan is known;
+    most: how many poses a search over exact poses may make. First a plan from x_t is looked for. Each other
+    first motion is undone to go the same way. If that comes too late, a plan after that motion is looked for.
     """
     count, steps = motions.shape
     way = make_way(world, t, steps, held)
@@ -116,17 +116,17 @@ def plan_all(
                 found = _rejoin(world, way, motions[base])
         read_at(world, way, n)
         foresee(world.literals, t + n, way.known, way.held, way.bounds)
-        if not found and left > 0.0 and (base >= 0 or lost > 0.0) and is_open(world.literals, way.bounds):
+        if not found and min(left, without_plan) > 0.0 and is_open(world.literals, way.bounds):
             found = search(world, way, nodes, n, effort * (1.0 if n == 0 else SHARE))
             if not found and root == -2:
                 found = search_exactly(world, way, nodes, effort, most)
         left -= 0.0 if root < 0 or found else way.spent[0] * count / USUAL_MOTIONS
-        lost -= 0.0 if root < -1 or found else way.spent[0]
+        without_plan -= 0.0 if root < -1 or found else way.spent[0]
         if root == -2 and not found:
             continue
         m = way.motions[0] if root == -2 else m
         if found and base < 0:
-            base = m
+            base, without_plan = m, np.inf
         if not found:
             stay(world, way, n, steps)
         motions[m] = way.motions

@@ -218,8 +218,8 @@ class PlannerPolicy(Carded):
         effort = self.share * self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals, barred=self._world.barred)
         held = rows[-1] if self.foreseen is None else self.foreseen
-        lost = math.inf if self.share == 1.0 else effort
-        allowed = effort, lost, int(self.share * most)
+        without_plan = math.inf if self.share == 1.0 else effort
+        allowed = effort, without_plan, int(self.share * most)
         first, found = plan_all(world, t, history[-1], held, known, *allowed, motions)
         return Proposal(motions, int(first)), bool(found)
 
