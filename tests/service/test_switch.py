@@ -235,7 +235,7 @@ def test_a_refusal_names_a_smaller_keep_out_that_is_taken_as_it_is(client, begin
     assert (keep_out["smaller_by"], keep_out["feasible_alone"], keep_out["late_by"]) == (0.16, False, None)
     taken = {**spec, "regions": {**spec["regions"], **keep_out["regions"]}}
     assert keep_out["regions"]["Wet"]["vertices"][0] == [1.81, 1.51]
-    assert refused["detail"].endswith("is broken already; with Wet smaller by 0.16 m all round, one does")
+    assert refused["detail"].endswith("already. A way was found with Wet smaller by 0.16 m all round")
     assert switch(session, 7, taken).status_code == 200
     assert step(session, 7, poses[7:8]).json()["mode"] == "shaped"
 

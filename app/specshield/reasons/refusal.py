@@ -137,7 +137,7 @@ def refusal(
         )
     bound = proof(shield.task, sure or shield.body, history, signals)
     if bound is not None:
-        instead = f"; with {ways}, one does" if (ways := _ways(relaxed.conjuncts)) else ""
+        instead = f". A way was found with {ways}" if (ways := _ways(relaxed.conjuncts)) else ""
         return Refusal(f"no way from here keeps the rule: {bound}{instead}", True, relaxed.conjuncts)
     message = (
         "no way from here was found that keeps the rule, which is no proof that there is none. "
